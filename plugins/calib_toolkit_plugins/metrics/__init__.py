@@ -1,0 +1,1 @@
+"""Appearance metrics, one per file (to come)."""

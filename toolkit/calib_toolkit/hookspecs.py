@@ -1,0 +1,153 @@
+"""The four hooks through which everything that is not the core arrives, and what each must return.
+
+A plugin is a module (or one file) with functions marked ``@hookimpl``; built-ins and a stranger's are
+registered alike, under the entry-point group ``calib_toolkit``. docs/write-a-plugin walks through one.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pluggy
+from numpy.typing import NDArray
+
+from calib_toolkit.types import Calibration, Log, Motions, Pair, PairEstimate, Stream, Trajectory
+
+hookspec = pluggy.HookspecMarker("calib_toolkit")
+hookimpl = pluggy.HookimplMarker("calib_toolkit")
+
+
+@dataclass(frozen=True)
+class NoOptions:
+    """For a sensor or metric without options."""
+
+
+@dataclass(frozen=True)
+class SensorTable:
+    """One ``[sensors.NAME]`` table of a rig.toml. folder: where its relative paths start."""
+
+    name: str
+    folder: Path
+    values: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A type of sensor: how its readings become motion with covariance.
+
+    id: what ``Stream.kind`` says. estimate: from a stream of at least two readings and an instance of
+    ``options`` (a frozen dataclass, every field defaulted) to the motion between its readings. It is called
+    on slices of ``chunk`` steps that share one reading, in any order and in parallel; it must be
+    deterministic and leave its inputs alone.
+    open_table: how a ``[sensors.NAME]`` table of a rig.toml becomes streams, or None if it can not.
+    version: raise it when the answers change, so that cached motions are made anew.
+    """
+
+    id: str
+    estimate: Callable[[Stream, Any], Motions | Trajectory]
+    options: type = NoOptions
+    open_table: Callable[[SensorTable], Log] | None = None
+    version: str = "1"
+    chunk: int = 50
+
+
+class Metric(Protocol):
+    """A measure of how well two sensors' appearance agrees. ``options`` is a frozen dataclass type."""
+
+    id: str
+    options: type
+
+    def accepts(self, kind_a: str, kind_b: str) -> bool:
+        """Whether it can compare these kinds of sensors, in this order."""
+        ...
+
+    def overlap(self, pair: Pair) -> bool:
+        """Whether the two see enough of the same place to compare."""
+        ...
+
+    def estimate(self, pair: Pair, options: Any) -> PairEstimate:
+        """``T_a_b`` with covariance from appearance alone (the motion prior divided out)."""
+        ...
+
+
+class CostMetric(ABC):
+    """A metric that only says how bad a pose is; the core searches for the best one."""
+
+    id: str
+    options: type = NoOptions
+
+    @abstractmethod
+    def accepts(self, kind_a: str, kind_b: str) -> bool:
+        """Whether it can compare these kinds of sensors, in this order."""
+
+    @abstractmethod
+    def cost(self, T_a_b: NDArray[np.float64], pair: Pair) -> float:
+        """Lower is better. T_a_b: (4, 4)."""
+
+    def overlap(self, pair: Pair) -> bool:
+        """Whether the two see enough of the same place to compare (by default: assume so)."""
+        return len(pair.selected) > 0
+
+
+@dataclass(frozen=True)
+class ReadContext:
+    """What a reader may ask of the core.
+
+    sensors: the installed sensor types by id. open_log: opens another recording, by any reader.
+    options: the reader's own options.
+    """
+
+    sensors: Mapping[str, Sensor]
+    open_log: Callable[[Path], Log]
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A format of recordings.
+
+    matches: whether a path looks like this format (cheap; never raises). looks_for: what it looks for, in
+    words, for the sentence when no reader knows a path. open: a Log whose readings stay on disk.
+    """
+
+    id: str
+    looks_for: str
+    matches: Callable[[Path], bool]
+    open: Callable[[Path, ReadContext], Log]
+    write: Callable[[Log, Path], None] | None = None
+
+
+@dataclass(frozen=True)
+class Exporter:
+    """A format of calibrations, out and back in."""
+
+    id: str
+    write: Callable[[Calibration, Path], None]
+    read: Callable[[Path], Calibration]
+
+
+class HookSpecs:
+    """Each hook returns a list, does no work, and is called once, when the registry is built."""
+
+    @hookspec
+    def calib_register_sensors(self) -> Sequence[Sensor]:
+        """Sensor types: how readings become motion with covariance."""
+        return []
+
+    @hookspec
+    def calib_register_metrics(self) -> Sequence[Metric | CostMetric]:
+        """Appearance metrics: how well two sensors that see the same place agree."""
+        return []
+
+    @hookspec
+    def calib_register_datasets(self) -> Sequence[Dataset]:
+        """Readers of recordings."""
+        return []
+
+    @hookspec
+    def calib_register_exporters(self) -> Sequence[Exporter]:
+        """Writers and readers of calibrations in other tools' formats."""
+        return []

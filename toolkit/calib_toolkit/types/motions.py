@@ -1,0 +1,96 @@
+"""How one sensor moved: steps with covariance, or a trajectory whose errors are correlated."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_toolkit import se3
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Motions:
+    """Measured motions of one sensor, each from its start stamp to its end stamp.
+
+    start, end: (n,) seconds; any spacing, gaps and overlap allowed.
+    vec: (n, 6) of ``T_start_end``: ``[x y z rx ry rz]``, metres and radians, angle-axis.
+    cov: (n, 6, 6) of vec, in that order; noise is additive per component, in the axes of the sensor at start.
+    has_scale: False if only the direction of the translation is known (then its length is one).
+    """
+
+    start: Array
+    end: Array
+    vec: Array
+    cov: Array
+    has_scale: bool = True
+
+    def __post_init__(self) -> None:
+        n = len(self.start)
+        shapes = {"end": (n,), "vec": (n, 6), "cov": (n, 6, 6)}
+        for name, shape in shapes.items():
+            if np.shape(getattr(self, name)) != shape:
+                raise ValueError(f"Motions.{name} has shape {np.shape(getattr(self, name))}, expected {shape}")
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    def __getitem__(self, part: slice | NDArray[np.bool_] | NDArray[np.int64]) -> "Motions":
+        return Motions(self.start[part], self.end[part], self.vec[part], self.cov[part], self.has_scale)
+
+    @staticmethod
+    def concatenate(parts: Sequence["Motions"]) -> "Motions":
+        """One after the other, in the order given."""
+        return Motions(
+            np.concatenate([p.start for p in parts]),
+            np.concatenate([p.end for p in parts]),
+            np.concatenate([p.vec for p in parts]),
+            np.concatenate([p.cov for p in parts]),
+            all(p.has_scale for p in parts),
+        )
+
+    def shifted(self, dt: float) -> "Motions":
+        """The same motions on a clock that reads ``dt`` seconds more."""
+        return Motions(self.start + dt, self.end + dt, self.vec, self.cov, self.has_scale)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses of one sensor in a world frame, with the two parts of their error.
+
+    stamps: (n,) seconds, increasing. T_world_sensor: (n, 4, 4).
+    cov: (n, 6, 6) of the error that each pose has on its own, independent of the others.
+    drift: (n, 6, 6) of the error gathered from pose k-1 to pose k, on top of all earlier drift; drift[0] is 0.
+    Both are of ``(dt, delta)`` in ``t_true = t + dt``, ``R_true = Exp(delta) R``, world axes for cov, axes of
+    the sensor at pose k-1 for drift.
+    """
+
+    stamps: Array
+    T_world_sensor: Array
+    cov: Array
+    drift: Array
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    @staticmethod
+    def concatenate(parts: Sequence["Trajectory"]) -> "Trajectory":
+        """Parts in one world frame, each beginning with the pose the one before it ended with."""
+        rest = [(p.stamps[1:], p.T_world_sensor[1:], p.cov[1:], p.drift[1:]) for p in parts[1:]]
+        first = parts[0]
+        columns = [(first.stamps, first.T_world_sensor, first.cov, first.drift), *rest]
+        stamps, poses, cov, drift = (np.concatenate(c) for c in zip(*columns, strict=True))
+        return Trajectory(stamps, poses, cov, drift)
+
+    def motions(self) -> Motions:
+        """Motion from each pose to the next, with the covariance that both poses and the drift give it."""
+        T_a, T_b = self.T_world_sensor[:-1], self.T_world_sensor[1:]
+        T_a_b = se3.relative(T_a, T_b)
+        J_a, J_b = se3.relative_jacobians(T_a, T_b)
+        cov = J_a @ self.cov[:-1] @ np.swapaxes(J_a, 1, 2) + J_b @ self.cov[1:] @ np.swapaxes(J_b, 1, 2)
+        vec = se3.vector(T_a_b)
+        to_vec = np.linalg.inv(se3.vec_jacobian(vec))
+        cov = to_vec @ (cov + self.drift[1:]) @ np.swapaxes(to_vec, 1, 2)
+        return Motions(self.stamps[:-1], self.stamps[1:], vec, cov)
