@@ -1,0 +1,68 @@
+"""The command ``calib-toolkit``: subcommands are imported when they are called, so that ``--help`` is instant.
+
+Exit statuses: 0 done; 1 refused, with one sentence; 2 wrong usage; 3 done, but data were skipped or something
+is wrong or not determined; 130 interrupted.
+"""
+
+from importlib import import_module
+from typing import Any
+
+import click
+
+from calib_toolkit.errors import CalibrationError
+
+COMMANDS = {
+    "run": "Calibrate the sensors of a drive.",
+    "inspect": "Show what a recording holds and what is wrong with it.",
+    "plugins": "List what is installed, and where from.",
+    "demo": "Calibrate a simulated drive and show truth beside estimate.",
+}
+"""Name of each command, which is its module here and the function in it, and what it does in one line."""
+
+
+class LazyGroup(click.Group):
+    """A group that imports a command only to run it, and turns every error into one line on stderr."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """The names, in the order in which one meets them."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """The command of that name, imported now, or None if there is none."""
+        if cmd_name not in COMMANDS:
+            return None
+        command: click.Command = getattr(import_module(f"calib_toolkit.cli.{cmd_name}"), cmd_name)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The list of commands in ``--help``, without importing any."""
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command. A refusal exits with 1, an interrupt with 130; ``--debug`` lets tracebacks through."""
+        try:
+            return super().invoke(ctx)
+        except (click.ClickException, click.Abort, click.exceptions.Exit, BrokenPipeError):
+            raise  # click's own business
+        except KeyboardInterrupt:
+            _exit(ctx, 130, "interrupted; finished work is kept, the same command goes on from there")
+        except Exception as e:
+            if ctx.params.get("debug"):
+                raise
+            if isinstance(e, CalibrationError):
+                _exit(ctx, 1, str(e))
+            what = " ".join(f"{type(e).__name__}: {e}".split())
+            _exit(ctx, 1, f"unexpected {what} (calib-toolkit --debug {ctx.invoked_subcommand} ... shows where)")
+
+
+def _exit(ctx: click.Context, status: int, sentence: str) -> None:
+    click.echo(f"calib-toolkit: {sentence}", err=True)
+    ctx.exit(status)
+
+
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="calib-toolkit", message="%(prog)s %(version)s")
+@click.option("--debug", is_flag=True, help="Show the whole traceback of an error.")
+def main(debug: bool) -> None:
+    """Extrinsics, clock offsets and their uncertainty of a vehicle's sensors, from an ordinary drive."""

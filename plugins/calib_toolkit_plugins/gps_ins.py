@@ -1,0 +1,176 @@
+"""GPS/INS: fixes of position and attitude become poses with covariance (the paper's section V-C).
+
+The world frame is the earth's own (ECEF, WGS-84): it needs no anchor, so every slice of a drive and every drive
+share it, and coordinates of 6e6 m cost no more than a nanometre.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calib_toolkit import DataError, Sensor, SensorTable, hookimpl, se3
+from calib_toolkit.types import Fix, Log, Stream, Trajectory
+from calib_toolkit_plugins.odometry import read_rows, table_file, to_nanoseconds, to_numbers, usable_rows
+
+Array = NDArray[np.float64]
+
+SEMI_MAJOR_AXIS, FLATTENING = 6378137.0, 1 / 298.257223563
+"""The WGS-84 ellipsoid; metres."""
+
+COLUMNS = ("stamp", "lat_deg", "lon_deg", "alt", "roll_deg", "pitch_deg", "yaw_deg")
+SIGMA_COLUMNS = ("sigma_east", "sigma_north", "sigma_up", "sigma_roll_deg", "sigma_pitch_deg", "sigma_yaw_deg")
+
+
+@dataclass(frozen=True)
+class GpsInsOptions:
+    """What is believed of a fix that does not state its own accuracy, and what counts as a jump.
+
+    sigma_position: metres, each axis. sigma_rpy_deg: degrees, each angle (0.01 is what the paper's author took for
+    KITTI, 0.03 for Shrimp). samples: draws of the Monte-Carlo conversion. max_speed: metres per second; a
+    faster step is a jump of the position solution.
+    """
+
+    sigma_position: float = 0.05
+    sigma_rpy_deg: float = 0.01
+    samples: int = 100
+    max_speed: float = 100.0
+
+
+def estimate(stream: Stream, options: GpsInsOptions) -> Trajectory:
+    """Poses in the earth frame from readings that are ``Fix``, with covariance by Monte Carlo (section V-C).
+
+    As in the paper, the errors of two fixes are taken as independent, although most of the error that an INS
+    states is shared by the fixes around it: relative motions are then better than claimed. A step faster than
+    ``max_speed`` is a jump: it is kept, with a drift sigma of its own length, so that it weighs nothing.
+    Raises DataError for fixes that are not numbers or not in radians.
+    """
+    if len(stream) < 2:
+        raise DataError(f"sensor {stream.name}: a motion takes two fixes, and there are {len(stream)}")
+    fixes = [stream.readings[i] for i in range(len(stream))]
+    rows = np.array([[f.lat, f.lon, f.alt, f.roll, f.pitch, f.yaw] for f in fixes])
+    sigma = np.array([_sigma(f, options) for f in fixes])
+    _check(stream, rows, sigma)
+    R_world_enu = enu_axes(rows[:, 0], rows[:, 1])
+    R_enu_sensor = _attitude(rows[:, 3:])
+    T = se3.rigid(R_world_enu @ R_enu_sensor, ecef(rows[:, 0], rows[:, 1], rows[:, 2]))
+    cov = _to_world(R_world_enu, _monte_carlo(rows[:, 3:], sigma, options.samples))
+    drift = np.zeros_like(cov)
+    step = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
+    jump = np.where(step > options.max_speed * np.diff(stream.stamps), step, 0.0)
+    drift[1:, :3, :3] = jump[:, None, None] ** 2 * np.eye(3)
+    return Trajectory(stream.stamps, T, cov, drift)
+
+
+def ecef(lat: Array, lon: Array, alt: Array) -> Array:
+    """Earth-centred, earth-fixed positions of WGS-84 geodetic ones. Radians and metres, (n,) each -> (n, 3)."""
+    e2 = FLATTENING * (2 - FLATTENING)
+    N = SEMI_MAJOR_AXIS / np.sqrt(1 - e2 * np.sin(lat) ** 2)
+    r = (N + alt) * np.cos(lat)
+    return np.stack([r * np.cos(lon), r * np.sin(lon), (N * (1 - e2) + alt) * np.sin(lat)], axis=-1)
+
+
+def enu_axes(lat: Array, lon: Array) -> Array:
+    """``R_ecef_enu``, whose columns are east, north and up. Radians, (n,) each -> (n, 3, 3)."""
+    s, c, so, co = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
+    east = np.stack([-so, co, np.zeros_like(s)], axis=-1)
+    north = np.stack([-s * co, -s * so, c], axis=-1)
+    up = np.stack([c * co, c * so, s], axis=-1)
+    return np.stack([east, north, up], axis=-1)
+
+
+def open_table(table: SensorTable) -> Log:
+    """The stream of one GPS/INS table of a rig.toml. Raises DataError.
+
+    ``fixes = FILE.csv``, whose first line names its columns: ``stamp,lat_deg,lon_deg,alt,roll_deg,pitch_deg,yaw_deg``
+    and at will ``sigma_east,sigma_north,sigma_up`` (metres) and ``sigma_roll_deg,sigma_pitch_deg,sigma_yaw_deg``.
+    """
+    for key in sorted(set(table.values) - {"kind", "fixes"}):
+        raise DataError(f"sensor {table.name}: a gps_ins table has no key '{key}'; it may have fixes")
+    header, *rows = read_rows(table_file(table, "fixes"), len(COLUMNS), len(COLUMNS + SIGMA_COLUMNS))
+    names = tuple(w.lower() for w in header.words)
+    if names[:7] != COLUMNS or names[7:] not in (SIGMA_COLUMNS, SIGMA_COLUMNS[:3], SIGMA_COLUMNS[3:], ()):
+        raise DataError(
+            f"{header.file}: its first line must be {','.join(COLUMNS)} and then, at will, "
+            f"{','.join(SIGMA_COLUMNS[:3])} and {','.join(SIGMA_COLUMNS[3:])}; it is {','.join(header.words)}"
+        )
+    rows = read_rows(header.file, len(names), len(names))[1:]
+    if not rows:
+        raise DataError(f"{header.file} holds no fixes below its first line; name a file that does")
+    stamps_ns = [to_nanoseconds(r) for r in rows]
+    numbers = np.array([to_numbers(r) for r in rows])
+    keep, notes = usable_rows(stamps_ns, numbers, rows)
+    epoch_ns = stamps_ns[keep[0]] or 0
+    stamps = np.array([(stamps_ns[i] or 0) - epoch_ns for i in keep]) * 1e-9
+    columns = {c: np.deg2rad(x) if c.endswith("_deg") else x for c, x in zip(names, numbers[keep].T, strict=True)}
+    values = np.stack([columns[c] for c in COLUMNS[1:]], axis=1)
+    position, rpy = (
+        np.stack([columns[c] for c in group], axis=1) if group[0] in columns else [None] * len(keep)
+        for group in (SIGMA_COLUMNS[:3], SIGMA_COLUMNS[3:])
+    )
+    fixes = [
+        Fix(v[0], v[1], v[2], v[3], v[4], v[5], p, a) for v, p, a in zip(values.tolist(), position, rpy, strict=True)
+    ]
+    return Log(header.file, {table.name: Stream(table.name, "gps_ins", stamps, fixes, notes=notes)}, epoch_ns)
+
+
+def _attitude(rpy: Array) -> Array:
+    """``R_enu_sensor`` of roll, pitch and yaw. (..., 3) -> (..., 3, 3)."""
+    R: Array = Rotation.from_euler("ZYX", rpy[..., ::-1].reshape(-1, 3)).as_matrix()
+    return R.reshape(*rpy.shape, 3)
+
+
+def _sigma(fix: Fix, options: GpsInsOptions) -> Array:
+    """(6,) east, north, up, roll, pitch, yaw: as stated, or where nothing or zero is stated as in the options."""
+    believed = np.repeat([options.sigma_position, np.deg2rad(options.sigma_rpy_deg)], 3)
+    stated = [np.zeros(3) if s is None else np.asarray(s, dtype=float) for s in (fix.sigma_position, fix.sigma_rpy)]
+    sigma = np.concatenate(stated)
+    return np.where(sigma == 0.0, believed, sigma)
+
+
+def _check(stream: Stream, rows: Array, sigma: Array) -> None:
+    """Refuses what can not be a fix, by name."""
+    degrees = (np.abs(rows[:, [0, 4]]).max(axis=1) > 1.6) | (np.abs(rows[:, [1, 3, 5]]).max(axis=1) > 6.3)
+    for bad, what in (
+        (~np.isfinite(rows).all(axis=1), "holds nan or inf; drop that fix"),
+        (
+            ~(np.isfinite(sigma) & (sigma > 0.0)).all(axis=1),
+            "states a sigma that is not positive; correct or drop it",
+        ),
+        (
+            degrees,
+            "has an angle beyond a full turn (or a latitude or pitch beyond 90 degrees); angles are in radians",
+        ),
+    ):
+        if bad.any():
+            k = int(np.argmax(bad))
+            raise DataError(f"sensor {stream.name}: fix {k} at {stream.stamps[k]:.3f} s {what}")
+
+
+def _monte_carlo(rpy: Array, sigma: Array, samples: int) -> Array:
+    """(n, 6, 6) covariance of ``(dt, delta)`` in east-north-up axes, from sigmas of position, roll, pitch, yaw.
+
+    Every fix gets the same draws, whose mean and covariance are made exactly those asked for: what is left to
+    chance is only how the angles bend.
+    """
+    half = np.random.default_rng(0).standard_normal((max(samples // 2, 6), 6))
+    draws = np.concatenate([half, -half])
+    draws = draws @ np.linalg.inv(np.linalg.cholesky(draws.T @ draws / len(draws))).T
+    error = draws * sigma[:, None, :]
+    R_drawn = _attitude(rpy[:, None, :] + error[..., 3:])
+    R_sensor_enu = np.swapaxes(_attitude(rpy), 1, 2)
+    error[..., 3:] = se3.log_so3(R_drawn @ R_sensor_enu[:, None])
+    return np.swapaxes(error, 1, 2) @ error / len(draws)
+
+
+def _to_world(R_world_enu: Array, cov: Array) -> Array:
+    turn = np.zeros_like(cov)
+    turn[:, :3, :3] = turn[:, 3:, 3:] = R_world_enu
+    return se3.rotate_cov(turn, cov)
+
+
+@hookimpl
+def calib_register_sensors() -> list[Sensor]:
+    """GPS/INS, whatever the receiver."""
+    return [Sensor("gps_ins", estimate, GpsInsOptions, open_table, chunk=1000)]

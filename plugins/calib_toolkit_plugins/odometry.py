@@ -1,0 +1,300 @@
+"""Odometry: poses or motions that something else estimated (visual or lidar odometry, SLAM, another INS)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from decimal import Decimal, InvalidOperation
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calib_toolkit import DataError, Sensor, SensorTable, hookimpl, se3
+from calib_toolkit.types import Log, MotionReading, Motions, PoseReading, Stream, Trajectory
+
+Array = NDArray[np.float64]
+
+COLUMNS = {"tum": (8, 8), "euroc": (8, 17), "kitti": (12, 12)}
+"""Fewest and most columns of each format's rows."""
+KEYS = ("kind", "poses", "format", "times", "has_scale", "motion_sigma", "sigmas")
+
+NOISE_FLOOR = np.array([1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5])
+"""No estimated noise of a step is believed to be below this (metres, radians)."""
+
+
+@dataclass(frozen=True)
+class OdometryOptions:
+    """How far readings are believed.
+
+    motion_sigma: one sigma of a step, ``[x y z rx ry rz]``, metres and radians, for readings that state no
+    covariance; None to estimate it from the motion. has_scale: None to take the stream's word for it.
+    """
+
+    motion_sigma: tuple[float, ...] | None = None
+    has_scale: bool | None = None
+
+
+def estimate(stream: Stream, options: OdometryOptions) -> Motions | Trajectory:
+    """Motion between successive readings, each a ``MotionReading`` or a ``PoseReading``.
+
+    Poses that all state a covariance stay a Trajectory; everything else becomes Motions, failed readings left
+    out. Without scale, translations are brought to unit length. Raises DataError.
+    """
+    readings = [stream.readings[i] for i in range(len(stream))]
+    if len(readings) < 2:
+        raise DataError(f"sensor {stream.name}: a motion takes two readings, and there are {len(readings)}")
+    has_scale = stream.has_scale if options.has_scale is None else options.has_scale
+    if isinstance(readings[0], MotionReading):
+        motions = _motions(stream, readings, options.motion_sigma)
+    else:
+        trajectory = _trajectory(stream, readings)
+        if has_scale and all(r.cov is not None for r in readings):
+            return trajectory
+        silent = np.array([a.cov is None or b.cov is None for a, b in pairwise(readings)])
+        motions = _with_sigma(stream.name, trajectory.motions(), silent, options.motion_sigma)
+    return motions if has_scale else unit_translations(motions)
+
+
+def noise_of_steps(name: str, motions: Motions) -> Array:
+    """One sigma of a step, (6,) metres and radians, told from the motion alone.
+
+    A vehicle's speed and turn rate hardly bend within three steps, so the second difference of the rates is
+    noise, sqrt(6) times one rate's. Its median absolute value over the steps made while moving bounds the noise
+    from above, whatever the outliers. Raises DataError with fewer than eight such differences.
+    """
+    rate = motions.vec / (motions.end - motions.start)[:, None]
+    length = np.linalg.norm(motions.vec[:, :3], axis=1)
+    joined = np.abs(motions.start[1:] - motions.end[:-1]) < 1e-6
+    moving = length >= 0.1 * np.quantile(length, 0.95) if len(length) else np.zeros(0, dtype=bool)
+    bend = np.diff(rate, 2, axis=0)[joined[1:] & joined[:-1] & moving[1:-1]]
+    if len(bend) < 8:
+        raise DataError(
+            f"sensor {name}: its {len(length)} steps are too few to tell their noise; state motion_sigma (six "
+            "numbers, metres and radians per step)"
+        )
+    period = float(np.median(motions.end - motions.start))
+    sigma = 1.4826 * period / np.sqrt(6) * np.median(np.abs(bend), axis=0)
+    return np.asarray(np.maximum(sigma, NOISE_FLOOR))
+
+
+def unit_translations(motions: Motions) -> Motions:
+    """The same motions with translations of length one, and the covariance of their direction.
+
+    ``u = t / |t|`` has the Jacobian ``(I - u u^T) / |t|``. A direction known to no better than a radian, and
+    that of no translation at all, gets variance one.
+    """
+    t = motions.vec[:, :3]
+    length = np.linalg.norm(t, axis=1)
+    zero = length == 0.0
+    length = np.where(zero, 1.0, length)
+    u = np.where(zero[:, None], [1.0, 0.0, 0.0], t / length[:, None])
+    tangent = np.eye(3) - u[:, :, None] * u[:, None, :]
+    J = np.zeros((len(u), 6, 6))
+    J[:, :3, :3] = tangent / length[:, None, None]
+    J[:, 3:, 3:] = np.eye(3)
+    cov = J @ motions.cov @ np.swapaxes(J, 1, 2)
+    vague = zero | (np.linalg.eigvalsh(cov[:, :3, :3])[:, -1] > 1.0)
+    cov[vague, :3, :] = cov[vague, :, :3] = 0.0
+    cov[vague, :3, :3] = tangent[vague]
+    cov[zero, :3, :3] = np.eye(3)
+    return Motions(motions.start, motions.end, np.hstack([u, motions.vec[:, 3:]]), cov, has_scale=False)
+
+
+def open_table(table: SensorTable) -> Log:
+    """The stream of one odometry table of a rig.toml. Raises DataError.
+
+    Keys: ``poses``, ``format`` (tum, euroc or kitti), ``times`` (kitti: one stamp in seconds a line), and at will
+    ``has_scale``, ``motion_sigma`` (six numbers: metres and radians of a step; estimated where absent), ``sigmas``
+    (a file of such six numbers a row: the step that ends at the pose of that row).
+    """
+    name, values = table.name, table.values
+    for key in [k for k in values if k not in KEYS]:
+        raise DataError(f"sensor {name}: an odometry table has no key '{key}'; it may have {', '.join(KEYS[1:])}")
+    style, has_scale = values.get("format"), values.get("has_scale", True)
+    if style not in COLUMNS:
+        raise DataError(f"sensor {name}: format = {style!r} is unknown; write one of {', '.join(COLUMNS)}")
+    if not isinstance(has_scale, bool):
+        raise DataError(f"sensor {name}: has_scale must be true or false, not {has_scale!r}")
+    rows = read_rows(table_file(table, "poses"), *COLUMNS[style])
+    timed = _rows_beside(table, "times", rows, 1) if style == "kitti" else rows
+    stamps_ns = [to_nanoseconds(r, "1e-9" if style == "euroc" else "1") for r in timed]
+    numbers = np.array([to_numbers(r)[: COLUMNS[style][0]] for r in rows])
+    keep, notes = usable_rows(stamps_ns, numbers, rows)
+    T = _poses(style, numbers[keep], [rows[i] for i in keep])
+    epoch_ns = stamps_ns[keep[0]] or 0
+    stamps = np.array([(stamps_ns[i] or 0) - epoch_ns for i in keep]) * 1e-9
+    steps = Trajectory(stamps, T, np.zeros((len(T), 6, 6)), np.zeros((len(T), 6, 6))).motions()
+    if "sigmas" in values:
+        sigmas = [_six(to_numbers(r), _place(r)) for r in _rows_beside(table, "sigmas", rows, 6)]
+        moved = [MotionReading(v, np.diag(sigmas[i] ** 2)) for v, i in zip(steps.vec, keep[1:], strict=True)]
+        stream = Stream(name, "odometry", stamps, [MotionReading(None), *moved], has_scale=has_scale, notes=notes)
+        return Log(rows[0].file, {name: stream}, epoch_ns)
+    stated = values.get("motion_sigma")
+    sigma = noise_of_steps(name, steps) if stated is None else _six(stated, f"sensor {name}: motion_sigma")
+    options = {"motion_sigma": tuple(sigma.tolist())}
+    readings = [PoseReading(pose) for pose in T]
+    stream = Stream(name, "odometry", stamps, readings, None, has_scale, options=options, notes=notes)
+    return Log(rows[0].file, {name: stream}, epoch_ns)
+
+
+class Row(NamedTuple):
+    """One row of a text table, and where it is."""
+
+    file: Path
+    line: int
+    words: list[str]
+
+
+def table_file(table: SensorTable, key: str) -> Path:
+    """The file that a key of a rig.toml table names. Raises DataError if it names none."""
+    value = table.values.get(key)
+    if not isinstance(value, str):
+        raise DataError(f'sensor {table.name}: its table in rig.toml needs a line {key} = "FILE"')
+    file = table.folder / value
+    if not file.is_file():
+        raise DataError(f"sensor {table.name}: {key} = {value!r}, but there is no file {file}; correct the path")
+    return file
+
+
+def read_rows(file: Path, fewest: int, most: int) -> list[Row]:
+    """Rows of a table parted by commas or blanks, without empty lines and # comments. Raises DataError."""
+    try:
+        lines = file.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as e:
+        raise DataError(f"{file} can not be read as text ({type(e).__name__}); name a text file") from e
+    kept = [(k, text) for k, line in enumerate(lines, start=1) if (text := line.partition("#")[0].strip())]
+    rows = [Row(file, k, [w.strip() for w in t.split(",")] if "," in t else t.split()) for k, t in kept]
+    for row in rows:
+        if not fewest <= len(row.words) <= most:
+            wanted = f"{fewest}" if fewest == most else f"{fewest} to {most}"
+            raise DataError(f"{_place(row)}: {len(row.words)} columns where {wanted} belong; correct or remove it")
+    if not rows:
+        raise DataError(f"{file} holds no rows; name a file that does")
+    return rows
+
+
+def to_numbers(row: Row) -> list[float]:
+    """What is written in a row, nan where nothing is. Raises DataError."""
+    try:
+        return [float(w or "nan") for w in row.words]
+    except ValueError as e:
+        raise DataError(f"{_place(row)}: {e}; every column must hold a number") from e
+
+
+def to_nanoseconds(row: Row, unit: str = "1") -> int | None:
+    """The first column, in units of ``unit`` seconds, as exact nanoseconds; None if it is nan. Raises DataError."""
+    try:
+        stamp = Decimal(row.words[0] or "nan") * Decimal(unit)
+    except InvalidOperation as e:
+        raise DataError(f"{_place(row)}: '{row.words[0]}' is not a stamp; correct or remove the row") from e
+    if stamp.is_finite() and abs(stamp) > 9 * 10**9:
+        raise DataError(f"{_place(row)}: the stamp {row.words[0]} is beyond any clock; convert it to the right unit")
+    return round(stamp * 10**9) if stamp.is_finite() else None
+
+
+def usable_rows(
+    stamps_ns: Sequence[int | None], numbers: Array, rows: Sequence[Row]
+) -> tuple[list[int], tuple[str, ...]]:
+    """Indices of the rows that are whole and whose stamps increase, and a sentence on those left out.
+
+    Raises DataError if fewer than two are left, or fewer than half.
+    """
+    whole = np.array([s is not None for s in stamps_ns]) & np.isfinite(numbers).all(axis=1)
+    index = np.flatnonzero(whole)
+    ns = np.array([stamps_ns[i] for i in index.tolist()], dtype=np.int64)
+    limits = np.iinfo(np.int64)
+    after_all = ns > np.maximum.accumulate(np.append(limits.min, ns))[:-1]
+    before_all = ns < np.minimum.accumulate(np.append(limits.max, ns[::-1]))[-2::-1]
+    rising = after_all if after_all.sum() >= before_all.sum() else before_all  # one leap ahead costs only itself
+    keep = index[rising].tolist()
+    unusable = {
+        "hold nan or nothing": np.flatnonzero(~whole),
+        "have a stamp that goes back or repeats": index[~rising],
+    }
+    notes = tuple(
+        f"{rows[0].file}: {len(which)} of {len(rows)} rows {what}, the first in line {rows[which[0]].line}; left out"
+        for what, which in unusable.items()
+        if len(which)
+    )
+    if len(keep) < max(2, len(rows) / 2):
+        raise DataError(" and ".join(notes) or f"{rows[0].file} has one row; a motion takes two")
+    return keep, notes
+
+
+def _place(row: Row) -> str:
+    return f"{row.file}, line {row.line}"
+
+
+def _rows_beside(table: SensorTable, key: str, rows: Sequence[Row], columns: int) -> list[Row]:
+    others = read_rows(table_file(table, key), columns, columns)
+    if len(others) != len(rows):
+        raise DataError(f"{others[0].file} has {len(others)} rows and {rows[0].file} {len(rows)}; give one each")
+    return others
+
+
+def _poses(style: str, numbers: Array, rows: Sequence[Row]) -> Array:
+    """(n, 4, 4) poses; refuses what is further than 1 % from a rotation, and normalises the rest."""
+    if style == "kitti":
+        M = numbers.reshape(-1, 3, 4)
+        R, t = M[:, :, :3], M[:, :, 3]
+        gram = R @ np.swapaxes(R, 1, 2) - np.eye(3)
+        bad = (np.abs(gram).max(axis=(1, 2)) > 0.02) | (np.linalg.det(R) < 0.0)
+    else:
+        t, q = numbers[:, 1:4], numbers[:, 4:8]
+        bad = np.abs(np.linalg.norm(q, axis=1) - 1.0) > 0.01
+    if bad.any():
+        what = "matrix is no rotation" if style == "kitti" else "quaternion is not of length one"
+        raise DataError(f"{_place(rows[int(np.argmax(bad))])}: the {what}; is format = '{style}' right?")
+    rotation = Rotation.from_matrix(R) if style == "kitti" else Rotation.from_quat(q, scalar_first=style == "euroc")
+    return se3.rigid(rotation.as_matrix(), t)
+
+
+def _six(values: Any, where: str) -> Array:
+    try:
+        sigma = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        sigma = np.zeros(0)
+    if sigma.shape != (6,) or not np.all(np.isfinite(sigma) & (sigma > 0.0)):
+        raise DataError(f"{where} must be six positive numbers [x, y, z, rx, ry, rz], metres and radians per step")
+    return sigma
+
+
+def _with_sigma(name: str, motions: Motions, silent: NDArray[np.bool_], stated: Any) -> Motions:
+    """The motions, those that state none given that of the stated or estimated sigma."""
+    if not silent.any():
+        return motions
+    sigma = noise_of_steps(name, motions) if stated is None else _six(stated, f"sensor {name}: motion_sigma")
+    return replace(motions, cov=np.where(silent[:, None, None], np.diag(sigma**2), motions.cov))
+
+
+def _motions(stream: Stream, readings: Sequence[MotionReading], stated: Any) -> Motions:
+    made = np.array([k for k in range(1, len(readings)) if readings[k].vec is not None], dtype=int)
+    if not len(made):
+        raise DataError(f"sensor {stream.name}: none of its {len(readings)} readings holds a motion; leave it out")
+    vec = np.array([readings[k].vec for k in made], dtype=float)
+    silent = np.array([readings[k].cov is None for k in made])
+    cov = np.array([np.zeros((6, 6)) if readings[k].cov is None else readings[k].cov for k in made], dtype=float)
+    _refuse(stream, made, np.isfinite(vec).all(axis=1) & np.isfinite(cov).all(axis=(1, 2)), "motion")
+    return _with_sigma(stream.name, Motions(stream.stamps[made - 1], stream.stamps[made], vec, cov), silent, stated)
+
+
+def _trajectory(stream: Stream, readings: Sequence[PoseReading]) -> Trajectory:
+    T = np.array([r.T_world_sensor for r in readings], dtype=float)
+    cov = np.array([np.zeros((6, 6)) if r.cov is None else r.cov for r in readings], dtype=float)
+    good = np.isfinite(T).all(axis=(1, 2)) & np.isfinite(cov).all(axis=(1, 2))
+    _refuse(stream, np.arange(len(T)), good, "pose")
+    return Trajectory(stream.stamps, T, cov, np.zeros_like(cov))
+
+
+def _refuse(stream: Stream, frames: NDArray[np.int64], good: NDArray[np.bool_], what: str) -> None:
+    if not good.all():
+        stamp = stream.stamps[frames[int(np.argmin(good))]]
+        raise DataError(f"sensor {stream.name}: its {what} at {stamp:.3f} s holds nan or inf; drop that reading")
+
+
+@hookimpl
+def calib_register_sensors() -> list[Sensor]:
+    """Odometry; one slice holds a whole drive, since its noise is told from all of it."""
+    return [Sensor("odometry", estimate, OdometryOptions, open_table, chunk=1_000_000)]

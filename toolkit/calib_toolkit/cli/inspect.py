@@ -1,0 +1,54 @@
+"""``calib-toolkit inspect``: what a recording holds and what is wrong with it."""
+
+import math
+from datetime import UTC, datetime
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.argument("drive", type=click.Path(path_type=Path))
+@click.option("--format", "format_id", metavar="ID", help="Reader to use; without it, the one that knows DRIVE.")
+@click.option("--plugin", "plugins", multiple=True, type=click.Path(path_type=Path), help="One-file plugin.")
+@click.pass_context
+def inspect(ctx: click.Context, drive: Path, format_id: str | None, plugins: tuple[Path, ...]) -> None:
+    """Show the sensors of DRIVE, their rates, spans and gaps, and what is wrong with the recording.
+
+    Exit status 0 if nothing is wrong, 3 if something is.
+    """
+    from rich.box import SIMPLE
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from calib_toolkit.inspection import inspect_log
+    from calib_toolkit.plugins import registry
+
+    log = registry(plugins).open_log(drive, format_id)
+    seen = inspect_log(log)
+    console = Console(highlight=False)
+    console.print(f"{seen.source}: {seen.duration:.1f} s{_date(log.epoch_ns)}", markup=False, soft_wrap=True)
+    table = Table("sensor", "kind", box=SIMPLE)
+    for column in ("readings", "rate Hz", "start s", "end s", "gaps", "longest s"):
+        table.add_column(column, justify="right")
+    for s in seen.sensors:
+        numbers = (_number(x, 3) for x in (s.rate, s.start, s.end))
+        table.add_row(
+            escape(s.name), escape(s.kind), str(s.readings), *numbers, str(s.gaps), _number(s.largest_gap, 4)
+        )
+    console.print(table)
+    for problem in seen.problems:
+        console.print(f"- {problem}", markup=False, soft_wrap=True)
+    if not seen.clean:
+        ctx.exit(3)
+    console.print("nothing wrong was found")
+
+
+def _date(epoch_ns: int) -> str:
+    dated = 10**17 < epoch_ns < 10**19  # anything else counts from a start of its own, not from 1970
+    return f", from {datetime.fromtimestamp(epoch_ns / 1e9, UTC):%F %T} UTC" if dated else ""
+
+
+def _number(x: float, digits: int) -> str:
+    return "-" if math.isnan(x) else f"{x:.{digits}f}"
