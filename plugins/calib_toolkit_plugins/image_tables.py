@@ -41,7 +41,7 @@ def open_cameras(table: SensorTable, kind: str, heads: Mapping[str, Mapping[str,
     (OpenCV's order) and ``mask`` (an image, non-zero where it may be used). An image belongs to a stamp by the last
     number in its name, so that one missing in one head shifts nothing. Raises DataError.
     """
-    files = {name: _images(name, _path(name, table, values, "images")) for name, values in heads.items()}
+    files = {name: _images(name, _path(f"sensor {name}", table, values, "images")) for name, values in heads.items()}
     times = _path(f"sensor {table.name}", table, table.values, "times")
     ns_of = _stamps_by_number(f"sensor {table.name}", times, sorted({n for images in files.values() for n in images}))
     epoch_ns = min(ns_of.values())
@@ -67,7 +67,6 @@ def refuse_unknown(where: str, values: Mapping[str, Any], known: Iterable[str]) 
 
 
 def _path(where: str, table: SensorTable, values: Mapping[str, Any], key: str) -> Path:
-    where = where if where.startswith("sensor ") else f"sensor {where}"
     value = values.get(key)
     if not isinstance(value, str):
         raise DataError(f"{where} needs '{key}' with a path; {'add it' if value is None else f'it is {value!r}'}")
@@ -157,7 +156,7 @@ def _intrinsics(
     h, w = image.shape[:2]
     mask = None
     if "mask" in values:
-        drawn = load_image(_path(name, table, values, "mask"))
+        drawn = load_image(_path(f"sensor {name}", table, values, "mask"))
         mask = np.asarray(drawn if drawn.ndim == 2 else drawn.max(axis=2), dtype=np.uint8)
         if mask.shape != (h, w):
             raise DataError(

@@ -3,7 +3,7 @@
 Harris corners spread over the image, pyramidal Lucas-Kanade with a forward-backward check, then two-view geometry.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from calib_toolkit import CameraIntrinsics, Log, Motions, Sensor, SensorTable, Stream, hookimpl, se3
 from calib_toolkit.errors import DataError
+from calib_toolkit_plugins.epipolar import Points, tangent
 from calib_toolkit_plugins.image_tables import open_cameras
-from calib_toolkit_plugins.two_view import Points, TwoViewMotion, tangent, two_view_motion
+from calib_toolkit_plugins.two_view import TwoViewMotion, two_view_motion
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -63,7 +64,7 @@ def estimate(stream: Stream, options: MonocularOptions) -> Motions:
     import cv2
 
     cv2.setNumThreads(1)  # slices run in parallel
-    camera = _checked(stream)
+    camera = _checked(stream, options)
     steps: list[tuple[float, float, Array, Array]] = []
     before: _View | None = None
     for stamp, reading in zip(stream.stamps, stream.readings, strict=True):
@@ -110,7 +111,9 @@ class _View:
     corners: NDArray[np.float32]
 
 
-def _checked(stream: Stream) -> CameraIntrinsics:
+def _checked(stream: Stream, options: MonocularOptions) -> CameraIntrinsics:
+    import cv2
+
     camera = stream.intrinsics
     if camera is None:
         raise DataError(
@@ -125,7 +128,11 @@ def _checked(stream: Stream) -> CameraIntrinsics:
         )
     if len(stream) < 2:
         raise DataError(f"sensor {stream.name} has {len(stream)} image(s); motion needs at least two")
-    return camera
+    if camera.mask is None:
+        return camera
+    # what may not be used may not lie in a corner's window either
+    usable = cv2.erode(np.where(camera.mask > 0, 255, 0).astype(np.uint8), np.ones((options.window,) * 2, np.uint8))
+    return replace(camera, mask=np.asarray(usable, np.uint8))
 
 
 def _view(where: str, stamp: float, reading: Any, camera: CameraIntrinsics, options: MonocularOptions) -> _View:
@@ -168,11 +175,10 @@ def _corners(grey: Image, camera: CameraIntrinsics, options: MonocularOptions) -
 
     h, w = grey.shape
     rows, columns = max(1, round(np.sqrt(32 * h / w))), max(1, round(np.sqrt(32 * w / h)))
-    mask = None if camera.mask is None else np.where(camera.mask > 0, 255, 0).astype(np.uint8)
     found = []
     for y0, y1 in zip(*_edges(h, rows), strict=True):
         for x0, x1 in zip(*_edges(w, columns), strict=True):
-            tile_mask = None if mask is None else np.ascontiguousarray(mask[y0:y1, x0:x1])
+            tile_mask = None if camera.mask is None else np.ascontiguousarray(camera.mask[y0:y1, x0:x1])
             corners = cv2.goodFeaturesToTrack(
                 np.ascontiguousarray(grey[y0:y1, x0:x1]),
                 -(-options.corners // (rows * columns)),

@@ -1,45 +1,37 @@
-"""Motion of a camera between two images, from points that both see (paper, section V-B).
+"""Motion of a camera between two images, from points that both see (paper, section V-B): which points agree on what.
 
-Points are *normalised*: undistorted, on the plane z = 1 of camera axes (x right, y down, z forward). With
-``T_prev_curr`` = (R, t), ``x_prev^T [t]x R x_curr = 0``; only the direction of t can be seen. Five parameters:
-``delta`` of ``R_true = Exp(delta) R`` and two in the tangent plane of the unit direction.
+The geometry, and what ``prev`` and ``curr`` hold, is in :mod:`~calib_toolkit_plugins.epipolar`.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from calib_toolkit import se3
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from calib_toolkit_plugins.epipolar import (
+    Array,
+    Mask,
+    Points,
+    covariance,
+    eight_point,
+    in_front,
+    pose_of,
+    refine,
+    sampson,
+)
 
 GATE, WIDE_GATE = 3.0, 5.0  # sigmas of a Sampson residual; beyond it a point is an outlier (at first, a wider one)
 RANGE_OF_NOISE = (0.2, 1.0)  # the measured noise tightens the gate, within these parts of the stated noise
-EPIPOLE = 20.0
 MIN_POINTS = 20
 MIN_SHARE = 0.4  # of the points must agree with the motion, or it is no motion of the scene
 MIN_IN_FRONT = 2 / 3  # of the agreeing points must lie in front of both cameras, or the sign is a guess
+MIN_ON_PLANE = 0.8  # of the points make a scene a plane
+AS_GOOD = 1.5  # times the squared residuals of the best, and another motion is not refuted
+MIN_APART = 0.1  # radians between directions that count as two
 MAX_STILL = 0.6  # of the points may stay where a turn puts them; else those that move may all be other traffic
 MAX_DIRECTION_SIGMA = 0.5  # radians; beyond it the sphere is not flat and the direction counts as unknown
-
-
-@dataclass(frozen=True)
-class Points:
-    """Normalised points of one image. xy: (n, 2). cov: (n, 2, 2), the noise of each."""
-
-    xy: Array
-    cov: Array
-
-    def __getitem__(self, part: Mask) -> "Points":
-        return Points(self.xy[part], self.cov[part])
-
-    @property
-    def rays(self) -> Array:
-        """(n, 3) with z = 1."""
-        return np.column_stack([self.xy, np.ones(len(self.xy))])
 
 
 @dataclass(frozen=True)
@@ -47,7 +39,8 @@ class TwoViewMotion:
     """Motion between two images.
 
     R, t: of ``T_prev_curr``, t of unit length, or None where only the rotation could be seen.
-    cov: (5, 5) of ``[delta (3), tangent (2)]``, the tangent in the axes of :func:`tangent`; (3, 3) when t is None.
+    cov: (5, 5) of ``[delta (3), tangent (2)]``,
+    the tangent in the axes of :func:`~calib_toolkit_plugins.epipolar.tangent`; (3, 3) when t is None.
     inliers: (n,) the points that agree.
     """
 
@@ -60,10 +53,11 @@ class TwoViewMotion:
 def two_view_motion(prev: Points, curr: Points) -> TwoViewMotion | None:
     """Motion between two images from matched points, or None where the points agree on none.
 
-    MAGSAC++ (successor of the paper's MAPSAC) finds the inliers, the normalised eight-point algorithm [24] and
-    cheirality the pose, and a few Gauss-Newton steps on the Sampson error the optimum, where the covariance holds.
-    Where turning alone explains the points as well (Torr's GRIC: a standing or purely turning camera), or most of
-    them, the direction is not determined and t is None.
+    Successors of the paper's MAPSAC find the inliers (OpenCV's USAC: graph-cut RANSAC with its MSAC score, and
+    MAGSAC++), the normalised eight-point algorithm [24] and cheirality the pose, and a few damped Gauss-Newton steps
+    the least Sampson error, where the covariance holds. Where turning alone explains the points as well (Torr's GRIC:
+    a standing or purely turning camera), or most of them, the direction is not determined and t is None. A scene that
+    is one plane can have two motions; then only a turn is considered.
     """
     if len(prev.xy) < MIN_POINTS:
         return None
@@ -73,113 +67,13 @@ def two_view_motion(prev: Points, curr: Points) -> TwoViewMotion | None:
         R, t, inliers = pose
         r = sampson(prev, curr, R, t)[0]
         still = np.mean(squares < (GATE * _noise(r)) ** 2)
-        if _gric(r**2, 3, 5) < _gric(squares, 2, 3) and still < MAX_STILL:
-            p, c = prev[inliers], curr[inliers]
+        p, c = prev[inliers], curr[inliers]
+        if _gric(r**2, 3, 5) < _gric(squares, 2, 3) and still < MAX_STILL and not _ambiguous(p, c, R, t):
             cov = covariance(p, c, R, t)
             seen = np.max(np.diag(cov)[3:]) < MAX_DIRECTION_SIGMA**2 and np.mean(in_front(p, c, R, t)) > MIN_IN_FRONT
             return TwoViewMotion(R, t, cov, inliers) if seen else TwoViewMotion(R, None, cov[:3, :3], inliers)
     agree = squares < GATE**2
     return TwoViewMotion(R_turn, None, cov_turn, agree) if _enough(agree) else None
-
-
-def tangent(t: Array) -> Array:
-    """Two unit vectors across a unit direction: (3, 2)."""
-    return np.linalg.svd(t[:, None])[0][:, 1:]
-
-
-def eight_point(prev: Points, curr: Points) -> Array:
-    """Essential matrix (3, 3) by the normalised eight-point algorithm; singular values (1, 1, 0). Needs 8 points."""
-    a, N_a = _hartley(prev.rays)
-    b, N_b = _hartley(curr.rays)
-    A = np.einsum("ni,nj->nij", a, b).reshape(-1, 9)
-    F = np.linalg.eigh(A.T @ A)[1][:, 0].reshape(3, 3)
-    U, _, Vt = np.linalg.svd(N_a.T @ F @ N_b)
-    return U @ np.diag([1.0, 1.0, 0.0]) @ Vt
-
-
-def pose_of(E: Array, prev: Points, curr: Points) -> tuple[Array, Array]:
-    """(R, t) of an essential matrix: of its four poses the one with most points in front of both cameras."""
-    U, _, Vt = np.linalg.svd(E)
-    W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    turns = [R * np.linalg.det(R) for R in (U @ W @ Vt, U @ W.T @ Vt)]
-    poses = [(R, t) for R in turns for t in (U[:, 2], -U[:, 2])]
-    return max(poses, key=lambda pose: np.sum(in_front(prev, curr, *pose)))
-
-
-def in_front(prev: Points, curr: Points, R: Array, t: Array) -> Mask:
-    """(n,) whether the point nearest to both rays has positive depth in both cameras (cheirality)."""
-    a, b = prev.rays, curr.rays @ R.T
-    aa, bb, ab = np.sum(a * a, 1), np.sum(b * b, 1), np.sum(a * b, 1)
-    at, bt = a @ t, b @ t
-    return (at * bb - ab * bt > 0) & (ab * at - aa * bt > 0)
-
-
-def sampson(prev: Points, curr: Points, R: Array, t: Array) -> tuple[Array, Array]:
-    """Sampson residuals in sigmas (n,), and their Jacobian (n, 5) over ``[delta, tangent]``.
-
-    The epipolar error ``x_prev^T E x_curr`` over its standard deviation under the points' own noise. At an epipole
-    that vanishes to first order, and a minimum would sit on every point; a second-order term, weighted by
-    ``EPIPOLE``, quiets the points around it.
-    """
-    error, in_prev, in_curr, M = _epipolar(prev, curr, R, t)
-    to_prev = np.einsum("nij,ni->nj", prev.cov, in_prev[0])
-    to_curr = np.einsum("nij,ni->nj", curr.cov, in_curr[0])
-    cov_var = np.einsum("kni,ni->nk", in_prev, to_prev) + np.einsum("kni,ni->nk", in_curr, to_curr)
-    B = prev.cov @ M[0, :2, :2] @ curr.cov
-    cov_var += EPIPOLE**2 * np.einsum("nij,kij->nk", B, M[:, :2, :2])
-    var, half_d_var = cov_var[:, :1], cov_var[:, 1:]
-    r = error[:, :1] / np.sqrt(var)
-    return r[:, 0], error[:, 1:] / np.sqrt(var) - r / var * half_d_var
-
-
-def refine(prev: Points, curr: Points, R: Array, t: Array) -> tuple[Array, Array]:
-    """(R, t) of least Sampson error, by Levenberg-Marquardt from a start."""
-    r, J = sampson(prev, curr, R, t)
-    damping = 1e-6
-    for _ in range(20):
-        H = J.T @ J
-        step = np.linalg.lstsq(H + damping * np.diag(np.diag(H)), -J.T @ r, rcond=1e-14)[0]
-        R_new, t_new = se3.exp_so3(step[:3]) @ R, t + tangent(t) @ step[3:]
-        t_new /= np.linalg.norm(t_new)
-        r_new, J_new = sampson(prev, curr, R_new, t_new)
-        gain = r @ r - r_new @ r_new
-        if gain > 0:
-            R, t, r, J, damping = R_new, t_new, r_new, J_new, damping / 10
-        else:
-            damping *= 100
-        if (gain < 1e-4 and damping < 1e-2) or damping > 1e4:  # of a cost that is one for each point
-            break
-    return R, t
-
-
-def covariance(prev: Points, curr: Points, R: Array, t: Array) -> Array:
-    """Covariance (5, 5) of ``[delta, tangent]`` at the optimum, from the noise of the points.
-
-    The approximate delta method (section VI-D1, Censi), ``H^-1 M cov(z) M^T H^-1``. With residuals in sigmas,
-    M cov(z) M^T is J^T J, and H is J^T J less what the noise of the points puts into it: where points hardly move,
-    noise alone looks like parallax, and claims to know the direction. Where that leaves nothing, the
-    direction's variance is infinite.
-    """
-    _, J = sampson(prev, curr, R, t)
-    _, in_prev, in_curr, M = _epipolar(prev, curr, R, t)
-    to_prev, to_curr = (np.einsum("nij,kni->knj", p.cov, g) for p, g in ((prev, in_prev), (curr, in_curr)))
-    C = np.einsum("kni,lni->nkl", in_prev, to_prev) + np.einsum("kni,lni->nkl", in_curr, to_curr)
-    var = C[:, 0, 0] + EPIPOLE**2 * np.einsum("nij,ij->n", prev.cov @ M[0, :2, :2] @ curr.cov, M[0, :2, :2])
-    noise = C[:, 1:, 1:] - C[:, 1:, :1] * C[:, :1, 1:] / var[:, None, None]  # what is not correlated with the error
-    information = J.T @ J
-    H = information - np.sum(noise / var[:, None, None], axis=0)
-    if np.linalg.eigvalsh(H)[0] <= 0:
-        return block_diag(np.linalg.pinv(information, hermitian=True)[:3, :3], np.diag([np.inf, np.inf]))
-    return np.linalg.solve(H, np.linalg.solve(H, information).T)
-
-
-def _epipolar(prev: Points, curr: Points, R: Array, t: Array) -> tuple[Array, Array, Array, Array]:
-    """The epipolar error and its derivatives over the five parameters (n, 6), the gradients of each over the
-    points of both images, (6, n, 2) twice, and the essential matrix with its derivatives, (6, 3, 3)."""
-    T = se3.skew(t)
-    M = np.concatenate([(T @ R)[None], T @ se3.skew(np.eye(3)) @ R, se3.skew(tangent(t).T) @ R])
-    lines_prev, lines_curr = curr.rays @ M.transpose(0, 2, 1), prev.rays @ M
-    return np.einsum("ni,kni->nk", prev.rays, lines_prev), lines_prev[..., :2], lines_curr[..., :2], M
 
 
 def turn(prev: Points, curr: Points) -> tuple[Array, Array, Array]:
@@ -188,15 +82,15 @@ def turn(prev: Points, curr: Points) -> tuple[Array, Array, Array]:
     Robust (Cauchy weights about the median residual). A translation too small to see still moves all points a
     little, and the turn takes up part of that: the covariance includes the mean square of what it left over.
     """
-    R, x = np.eye(3), curr.rays
+    R, x, W = np.eye(3), curr.rays, np.linalg.inv(prev.cov + curr.cov)
     for _ in range(30):
         y = x @ R.T
+        y[:, 2] = np.maximum(y[:, 2], 1e-3)  # what turns out of view is an outlier, not an error
         P = y[:, :2] / y[:, 2:]
         left = prev.xy - P
         D = np.concatenate([np.broadcast_to(np.eye(2), (len(P), 2, 2)), -P[:, :, None]], axis=2) / y[:, 2, None, None]
         J = D @ -se3.skew(y)
-        W = np.linalg.inv(prev.cov + curr.cov)
-        squares = np.einsum("ni,nij,nj->n", left, W, left)
+        squares = _squares(left, W)
         weight = 1 / (1 + squares / max(1.0, float(np.median(squares))))
         H = np.einsum("n,nia,nij,njb->ab", weight, J, W, J, optimize=True)
         step = np.linalg.solve(H, np.einsum("n,nia,nij,nj->a", weight, J, W, left, optimize=True))
@@ -231,8 +125,46 @@ def _move(prev: Points, curr: Points) -> tuple[Array, Array, Mask] | None:
 def _regated(prev: Points, curr: Points, R: Array, t: Array, gate: float) -> list[tuple[Array, Array, Mask]]:
     """The pose refined on the points within the gate, and these inliers; nothing where too few agree."""
     r = np.abs(sampson(prev, curr, R, t)[0])
-    inliers = r < gate * _noise(r)
+    inliers = (r < gate * _noise(r)) & ~_behind(prev, curr, R, t)
     return [(*refine(prev[inliers], curr[inliers], R, t), inliers)] if _enough(inliers) else []
+
+
+def _behind(prev: Points, curr: Points, R: Array, t: Array) -> Mask:
+    """(n,) whether a point moved along its epipolar line the wrong way, by more than its noise."""
+    y = curr.rays @ R.T
+    far = y[:, :2] / y[:, 2:]
+    way = t[:2] - t[2] * far  # of nearer points
+    moved = np.sum((prev.xy - far) * way, axis=1)
+    return moved < -GATE * np.sqrt(_squares(way, prev.cov + curr.cov))
+
+
+def _ambiguous(prev: Points, curr: Points, R: Array, t: Array) -> bool:
+    """Whether the points lie on a plane, and its other motion explains them as well."""
+    import cv2
+
+    H: Any = cv2.findHomography(curr.xy, prev.xy)[0]
+    if H is None:
+        return False
+    r = sampson(prev, curr, R, t)[0]
+    y = curr.rays @ H.T
+    squares = _squares(prev.xy - y[:, :2] / y[:, 2:], np.linalg.inv(prev.cov + curr.cov))
+    if np.mean(squares < (GATE * _noise(r)) ** 2) < MIN_ON_PLANE:
+        return False
+    _, turns, shifts, _ = cv2.decomposeHomographyMat(H, np.eye(3))
+    for R_start, shift in zip(turns, shifts, strict=True):
+        length = np.linalg.norm(shift)
+        if length > 1e-9:
+            R_other, t_other = refine(prev, curr, np.asarray(R_start, np.float64), shift.ravel() / length)
+            as_good = np.sum(sampson(prev, curr, R_other, t_other)[0] ** 2) < AS_GOOD * (r @ r)
+            in_view = np.mean(in_front(prev, curr, R_other, t_other)) > MIN_IN_FRONT
+            if as_good and in_view and t @ t_other < np.cos(MIN_APART):
+                return True
+    return False
+
+
+def _squares(left: NDArray[np.floating[Any]], W: NDArray[np.floating[Any]]) -> Array:
+    """(n,) squared lengths of (n, 2) under (n, 2, 2)."""
+    return np.einsum("ni,nij,nj->n", left, W, left)
 
 
 def _noise(r: Array) -> float:
@@ -250,11 +182,3 @@ def _gric(squares: Array, dimension: int, parameters: int) -> float:
     return float(
         np.sum(np.minimum(squares, 2.0 * (4 - dimension))) + n * dimension * np.log(4) + parameters * np.log(4 * n)
     )
-
-
-def _hartley(rays: Array) -> tuple[Array, Array]:
-    """Points moved to zero mean and mean distance sqrt(2), and the (3, 3) matrix that does it."""
-    centre = rays[:, :2].mean(axis=0)
-    scale = np.sqrt(2) / max(float(np.mean(np.linalg.norm(rays[:, :2] - centre, axis=1))), 1e-12)
-    N = np.array([[scale, 0, -scale * centre[0]], [0, scale, -scale * centre[1]], [0, 0, 1]])
-    return rays @ N.T, N

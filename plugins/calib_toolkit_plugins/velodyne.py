@@ -29,8 +29,10 @@ class VelodyneOptions:
     range_sigma: noise along the beam from which the covariance follows (the paper's 0.1 m).
     max_jump: how far a step may be from the one before it; also the sigma of what the surroundings do not show.
     min_overlap: share of a sweep that must lie on the surfaces of the sweep before. min_points: with fewer left
-    of it, a sweep is not used. deskew: move points to where the scanner was at the stamp. point_to_plane: answer
-    with the paper's point-to-plane minimum instead of the plane-to-plane one, which is the more accurate.
+    of it, a sweep is not used. deskew: move points to where the scanner was at the stamp. smoothing: weight of
+    all earlier motions beside the previous one in doing so; 0 is the paper's, but one step's roll and pitch say
+    little of the next. point_to_plane: answer with the paper's point-to-plane minimum instead of the
+    plane-to-plane one, which is the more accurate.
     """
 
     min_range: float = 2.0
@@ -42,6 +44,7 @@ class VelodyneOptions:
     min_overlap: float = 0.5
     min_points: int = 200
     deskew: bool = True
+    smoothing: float = 0.5
     point_to_plane: bool = False
 
 
@@ -61,16 +64,17 @@ def estimate(stream: Stream, options: VelodyneOptions) -> Motions:
     if len(stream) < 2:
         raise DataError(f"sensor {stream.name}: a motion takes two scans, and there are {len(stream)}")
     steps = []
-    prev, velocity = _Sweep.read(stream, 0, options), None
+    prev, velocity, steady = _Sweep.read(stream, 0, options), None, None
     for k in range(1, len(stream)):
         curr, dt = _Sweep.read(stream, k, options), float(stream.stamps[k] - stream.stamps[k - 1])
-        step = _step(prev, curr, dt, velocity, options)
+        step = _step(prev, curr, dt, velocity, steady, options)
         if step is None:
-            prev, velocity = curr, None
+            prev, velocity, steady = curr, None, None
         else:
             T_prev_curr, cov, prev = step
             vec = se3.vector(T_prev_curr)
             velocity = vec / dt
+            steady = velocity if steady is None else options.smoothing * steady + (1 - options.smoothing) * velocity
             steps.append((stream.stamps[k - 1], stream.stamps[k], vec, cov))
     if not steps:
         return Motions(np.zeros(0), np.zeros(0), np.zeros((0, 6)), np.zeros((0, 6, 6)))
@@ -132,19 +136,21 @@ class _Sweep:
 
 
 def _step(
-    prev: _Sweep, curr: _Sweep, dt: float, velocity: Array | None, options: VelodyneOptions
+    prev: _Sweep, curr: _Sweep, dt: float, velocity: Array | None, steady: Array | None, options: VelodyneOptions
 ) -> tuple[Array, Array, _Sweep] | None:
-    """``T_prev_curr``, its covariance, and the current sweep with its surface; None where it fails."""
+    """``T_prev_curr``, its covariance, and the current sweep with its surface; None where it fails.
+
+    velocity foresees the motion, steady moves the points; None at the start.
+    """
     if not (prev.enough and curr.enough):
         return None
     if velocity is None:
         a, b = prev.surface(None), curr.surface(None)
         T_first = registration.register(a, b, np.eye(4), registration.FAR_LEVELS, options.gate)
-        velocity, predicted = se3.vector(T_first) / dt, None
-        T_seed = T_first
+        predicted, T_seed, steady = None, T_first, se3.vector(T_first) / dt
     else:
         predicted = T_seed = se3.matrix(velocity * dt)
-    a, b = prev.surface(velocity), curr.surface(velocity)
+    a, b = prev.surface(steady), curr.surface(steady)
     T = registration.register(a, b, T_seed, registration.NEAR_LEVELS, options.gate)
     if options.point_to_plane:
         T = registration.point_to_plane(a, b, T, options.gate)

@@ -5,8 +5,9 @@ import pytest
 from numpy.typing import NDArray
 
 from calib_toolkit import se3
-from calib_toolkit_plugins import two_view
-from calib_toolkit_plugins.two_view import Points, TwoViewMotion, two_view_motion
+from calib_toolkit_plugins import epipolar
+from calib_toolkit_plugins.epipolar import Points
+from calib_toolkit_plugins.two_view import TwoViewMotion, two_view_motion
 
 Array = NDArray[np.float64]
 FOCAL = 550.0  # pixels
@@ -35,7 +36,7 @@ def errors(found: TwoViewMotion, vec: Array) -> Array:
     """The five errors in the axes of the covariance."""
     assert found.t is not None
     turn = se3.log_so3(se3.exp_so3(vec[3:]) @ found.R.T)
-    return np.concatenate([turn, two_view.tangent(found.t).T @ vec[:3] / np.linalg.norm(vec[:3])])
+    return np.concatenate([turn, epipolar.tangent(found.t).T @ vec[:3] / np.linalg.norm(vec[:3])])
 
 
 def motion(*points: Points) -> TwoViewMotion:
@@ -76,7 +77,8 @@ def test_forward_is_forward() -> None:
 
 def test_wrong_matches_are_left_out() -> None:
     squares = nees(FORWARD, range(40), outliers=0.15)
-    assert np.median(squares) < 6.0
+    assert np.median(squares) < 7.0  # a wrong match along its epipolar line can not be told
+    assert squares.max() < 100.0
     prev, curr = view(3, outliers=0.3)
     assert 0.6 * 300 < motion(prev, curr).inliers.sum() < 0.8 * 300
 
@@ -88,10 +90,10 @@ def test_the_jacobian_is_the_derivative() -> None:
     h = 1e-7
     numeric = []
     for step in h * np.eye(5):
-        moved = t + two_view.tangent(t) @ step[3:]
-        ends = (two_view.sampson(prev, curr, se3.exp_so3(s * step[:3]) @ R, t + s * (moved - t))[0] for s in (1, -1))
+        moved = t + epipolar.tangent(t) @ step[3:]
+        ends = (epipolar.sampson(prev, curr, se3.exp_so3(s * step[:3]) @ R, t + s * (moved - t))[0] for s in (1, -1))
         numeric.append(np.subtract(*ends) / (2 * h))
-    J = two_view.sampson(prev, curr, R, t)[1]
+    J = epipolar.sampson(prev, curr, R, t)[1]
     np.testing.assert_allclose(J, np.transpose(numeric), rtol=1e-4, atol=1e-4 * np.abs(J).max())
 
 
@@ -101,8 +103,8 @@ def test_eight_points_without_noise_give_the_essential_matrix() -> None:
     X = prev.rays * np.linspace(5, 30, 12)[:, None]
     seen = (X - T[:3, 3]) @ T[:3, :3]
     curr = Points(seen[:, :2] / seen[:, 2:], curr.cov)
-    E = two_view.eight_point(prev, curr)
-    R, t = two_view.pose_of(E, prev, curr)
+    E = epipolar.eight_point(prev, curr)
+    R, t = epipolar.pose_of(E, prev, curr)
     np.testing.assert_allclose(R, T[:3, :3], atol=1e-9)
     np.testing.assert_allclose(t, T[:3, 3] / np.linalg.norm(T[:3, 3]), atol=1e-8)
 
@@ -111,8 +113,8 @@ def test_refinement_is_better_than_the_eight_points() -> None:
     ratios = []
     for seed in range(20):
         prev, curr = view(seed)
-        start = two_view.pose_of(two_view.eight_point(prev, curr), prev, curr)
-        end = two_view.refine(prev, curr, *start)
+        start = epipolar.pose_of(epipolar.eight_point(prev, curr), prev, curr)
+        end = epipolar.refine(prev, curr, *start)
         truth = FORWARD[:3] / np.linalg.norm(FORWARD[:3])
         ratios.append(np.linalg.norm(end[1] - truth) / np.linalg.norm(start[1] - truth))
     assert np.median(ratios) < 1.0
@@ -143,16 +145,21 @@ def test_a_standing_camera_among_moving_things_only_turns() -> None:
     assert np.linalg.norm(se3.log_so3(found.R)) < 1e-3
 
 
-def test_a_plane_is_scene_enough() -> None:
-    """All eight-point equations of a plane are alike; five points and the pose's own limits still do."""
+def test_a_plane_alone_has_two_motions_and_gives_none() -> None:
     road = np.array([0.02, 0.1, 0.08])
-    good = 0
-    for seed in range(20):
-        found = motion(*view(seed, plane=road))
-        if found.t is not None:
-            e = errors(found, FORWARD)
-            good += bool(e @ np.linalg.solve(found.cov, e) < 25)
-    assert good >= 16
+    assert all(two_view_motion(*view(seed, plane=road)) is None for seed in range(10))
+
+
+def test_a_plane_with_a_few_points_off_it_has_one_motion() -> None:
+    for seed in range(10):
+        flat, deep = view(seed, n=200, plane=np.array([0.02, 0.1, 0.08])), view(seed + 100, n=80)
+        pair = [
+            Points(np.concatenate([a.xy, b.xy]), np.concatenate([a.cov, b.cov]))
+            for a, b in zip(flat, deep, strict=True)
+        ]
+        found = motion(*pair)
+        e = errors(found, FORWARD)
+        assert e @ np.linalg.solve(found.cov, e) < 25
 
 
 def test_no_motion_out_of_chance_or_too_few() -> None:

@@ -47,7 +47,9 @@ class Sums:
         """q parameters, n sensors, m steps, d numbers a reading."""
         return Sums(np.zeros((q, q)), np.zeros((n, m, q, d)))
 
-    def add(self, steps: NDArray[np.int64], x: int, y: int, J: Array, weight: Array, E_x: Array, E_y: Array) -> None:
+    def add(
+        self, steps: NDArray[np.int64], x: int, y: int, J: Array, weight: NDArray[np.floating], E_x: Array, E_y: Array
+    ) -> None:
         """One pair. J: (k, e, q) of its residual by the parameters, at the k steps kept; weight: (k, e, e)
         inverse covariance; E_x, E_y: (k, e, d) of the residual by each reading, or one for all."""
         JtW = np.swapaxes(J, 1, 2) @ weight
@@ -57,7 +59,7 @@ class Sums:
 
     def cramer_rao(self) -> Array:
         """The bound (q, q): the inverse of the information."""
-        return np.linalg.pinv(self.information, hermitian=True)
+        return np.asarray(np.linalg.pinv(self.information, hermitian=True), dtype=np.float64)
 
     def approximate_delta(self, cov: Array) -> Array:
         """The approximate delta method (q, q), from each reading's covariance (n, m, d, d)."""

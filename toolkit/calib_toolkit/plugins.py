@@ -138,9 +138,17 @@ def _module_from(file: Path) -> ModuleType:
     if spec is None or spec.loader is None:
         raise PluginError(f"--plugin {file}: not a Python file")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # so that what it defines can be pickled
+    sys.modules[name] = module
     spec.loader.exec_module(module)
+    _send_by_value(module)
     return module
+
+
+def _send_by_value(module: ModuleType) -> None:
+    """Other processes can not import a loose file, so what it defines travels with the work."""
+    from joblib.externals import cloudpickle
+
+    cloudpickle.register_pickle_by_value(module)
 
 
 def _load(load: Callable[[], ModuleType], label: str) -> ModuleType:
@@ -148,7 +156,7 @@ def _load(load: Callable[[], ModuleType], label: str) -> ModuleType:
         return load()
     except PluginError:
         raise
-    except Exception as e:
+    except (Exception, SystemExit) as e:
         raise PluginError(
             f"plugin {label} could not be loaded ({type(e).__name__}: {e}); mend or uninstall it"
         ) from e

@@ -26,7 +26,7 @@ class RotationOptions:
 
 @dataclass(frozen=True)
 class Rotations:
-    """R_base_sensor: (n, 3, 3). cov: (3n, 3n) of ``delta`` in ``R_true = Exp(delta) R``, base axes; base rows zero."""
+    """R_base_sensor: (n, 3, 3). cov: (3n, 3n) of ``delta`` in ``R_true = Exp(delta) R``, base axes."""
 
     R_base_sensor: Array
     cov: Array

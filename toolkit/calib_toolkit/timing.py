@@ -4,8 +4,8 @@ All points of a rigid body turn through the same angle (equation 6), whatever th
 are found from the angles alone. ``dt`` is added to a sensor's stamps to get base time; the base is the first.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,16 +38,22 @@ class TimeOffsets:
 
     dt: Array
     cov: Array
-    statistics: dict[str, float] = field(default_factory=dict)
 
 
-def estimate(chains: Sequence[Chain], clocks: Sequence[int], options: TimingOptions) -> TimeOffsets:
-    """Offsets of all sensors to the first. clocks: (n,) sensors with equal numbers share one offset."""
+def estimate(chains: Sequence[Chain], clocks: Sequence[Hashable], options: TimingOptions) -> TimeOffsets:
+    """Offsets of all sensors to the first. clocks: (n,) sensors with equal ones share one offset."""
     groups = _groups(clocks)
     start = initialise(chains, options)[_first_of(groups)]
     dt = optimise(start, chains, groups, options)
     to_clock = _to_clock(groups)
     return TimeOffsets(_spread(dt, groups), to_clock @ uncertainty(dt, chains, groups, options) @ to_clock.T)
+
+
+def without(offsets: TimeOffsets, unknown: NDArray[np.bool_]) -> TimeOffsets:
+    """The same offsets with the unknown ones (n,) taken as zero, as the paper does before it knows any."""
+    dt, cov = offsets.dt.copy(), offsets.cov.copy()
+    dt[unknown], cov[unknown], cov[:, unknown] = 0.0, 0.0, 0.0
+    return TimeOffsets(dt, cov)
 
 
 def initialise(chains: Sequence[Chain], options: TimingOptions) -> Array:
@@ -109,7 +115,7 @@ def _angles(dt: Array, chains: Sequence[Chain], steps: int) -> tuple[Array, Arra
     return angles(moved, np.linspace(lo, hi, steps + 1))
 
 
-def _groups(clocks: Sequence[int]) -> Array:
+def _groups(clocks: Sequence[Hashable]) -> Array:
     """(n,) 0 for sensors on the first's clock, then 1, 2, ... in order of appearance."""
     order = list(dict.fromkeys(clocks))
     return np.array([order.index(c) for c in clocks], dtype=float)

@@ -77,11 +77,13 @@ class Trajectory:
 
     @staticmethod
     def concatenate(parts: Sequence["Trajectory"]) -> "Trajectory":
-        """Parts in one world frame, each beginning with the pose the one before it ended with."""
-        rest = [(p.stamps[1:], p.T_world_sensor[1:], p.cov[1:], p.drift[1:]) for p in parts[1:]]
-        first = parts[0]
-        columns = [(first.stamps, first.T_world_sensor, first.cov, first.drift), *rest]
-        stamps, poses, cov, drift = (np.concatenate(c) for c in zip(*columns, strict=True))
+        """Parts in one world frame, in order; what a part repeats of the one before it is left out."""
+        last, kept = -np.inf, []
+        for part in parts:
+            new = part.stamps > last
+            kept.append((part.stamps[new], part.T_world_sensor[new], part.cov[new], part.drift[new]))
+            last = part.stamps[-1]
+        stamps, poses, cov, drift = (np.concatenate(c) for c in zip(*kept, strict=True))
         return Trajectory(stamps, poses, cov, drift)
 
     def motions(self) -> Motions:

@@ -1,0 +1,68 @@
+"""What the stages found, as one calibration."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_toolkit import se3
+from calib_toolkit.rotation import Rotations
+from calib_toolkit.timing import TimeOffsets
+from calib_toolkit.translation import Translations
+from calib_toolkit.types import Calibration, Undetermined
+from calib_toolkit.types.calibration import PARAMETERS
+
+Array = NDArray[np.float64]
+
+SHARE = 0.3
+"""A parameter is not determined if an undetermined direction has at least this component along it."""
+
+
+def determined(names: Sequence[str], undetermined: Sequence[Undetermined]) -> NDArray[np.bool_]:
+    """(n, 7) whether each sensor's each parameter is determined."""
+    known = np.ones((len(names), len(PARAMETERS)), dtype=bool)
+    for u in undetermined:
+        for key, component in u.direction.items():
+            name, _, parameter = key.rpartition(".")
+            if abs(component) >= SHARE:
+                known[names.index(name), PARAMETERS.index(parameter)] = False
+    return known
+
+
+def calibration(
+    names: tuple[str, ...],
+    has_scale: NDArray[np.bool_],
+    undetermined: Sequence[Undetermined],
+    offsets: TimeOffsets,
+    rotations: Rotations | None = None,
+    translations: Translations | None = None,
+) -> Calibration:
+    """The calibration after as many stages as are given; what later ones will find is not determined yet.
+
+    The stages are estimated one after the other, so their covariances fill blocks of the joint one.
+    """
+    n = len(names)
+    known = determined(names, undetermined)
+    R, t = np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3))
+    cov = np.zeros((n, 7, n, 7))
+    cov[:, 6, :, 6] = offsets.cov
+    if rotations is None:
+        known[1:, 3:6] = False
+    else:
+        R = rotations.R_base_sensor
+        cov[:, 3:6, :, 3:6] = rotations.cov.reshape(n, 3, n, 3)
+    if translations is None:
+        known[1:, :3] = False
+    else:
+        t = translations.t_base_sensor
+        cov[:, :3, :, :3] = translations.cov.reshape(n, 3, n, 3)
+    return Calibration(
+        names[0],
+        names,
+        se3.rigid(R, t),
+        offsets.dt,
+        cov.reshape(7 * n, 7 * n),
+        has_scale,
+        known,
+        tuple(undetermined),
+    )

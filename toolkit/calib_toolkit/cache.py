@@ -1,0 +1,85 @@
+"""Motions that were estimated before, kept on disk under a hash of everything they came from."""
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+from zlib import crc32
+
+import joblib
+import numpy as np
+
+from calib_toolkit.types import LazyReadings, Motions, Trajectory
+
+FORMAT = 1
+"""Raised when what is stored changes shape."""
+
+
+def default_folder() -> Path:
+    """``$CALIB_TOOLKIT_CACHE``, or the user's cache folder."""
+    chosen = os.environ.get("CALIB_TOOLKIT_CACHE")
+    if chosen:
+        return Path(chosen)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "calib-toolkit"
+
+
+def key_of(*parts: Any) -> str:
+    """One hash of anything picklable. A file counts by name, size, time of change and its first and last 4 KiB."""
+    return str(joblib.hash([FORMAT, *(_plain(p) for p in parts)]))
+
+
+def load(folder: Path, key: str) -> tuple[Motions | Trajectory, tuple[str, ...]] | None:
+    """What was stored under a key, or None; a damaged file counts as none."""
+    try:
+        with np.load(_file(folder, key), allow_pickle=False) as stored:
+            kind = {"Motions": Motions, "Trajectory": Trajectory}[str(stored["kind"])]
+            values = {f.name: stored[f.name] for f in fields(kind)}
+            if "has_scale" in values:
+                values["has_scale"] = bool(values["has_scale"])
+            return kind(**values), tuple(str(n) for n in stored["notes"])
+    except (OSError, KeyError, ValueError, EOFError):
+        return None
+
+
+def store(folder: Path, key: str, motion: Motions | Trajectory, notes: Sequence[str]) -> None:
+    """Keep a motion; whole or not at all, so that a kill leaves nothing half-written."""
+    file = _file(folder, key)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    part = file.with_suffix(f".{os.getpid()}.part")
+    values = {f.name: np.asarray(getattr(motion, f.name)) for f in fields(motion)}
+    with part.open("wb") as f:
+        np.savez(
+            f, allow_pickle=False, kind=np.array(type(motion).__name__), notes=np.array(notes, dtype=str), **values
+        )
+    part.replace(file)
+
+
+def _file(folder: Path, key: str) -> Path:
+    return folder / key[:2] / f"{key}.npz"
+
+
+def _plain(value: Any) -> Any:
+    """The value with every file in it replaced by what tells the file from others."""
+    if isinstance(value, Path):
+        return _signature(value)
+    if isinstance(value, LazyReadings):
+        return [value.load, [_plain(k) for k in value.keys]]
+    if isinstance(value, Mapping):
+        return {k: _plain(v) for k, v in value.items()}
+    if is_dataclass(value) and not isinstance(value, type):
+        return [type(value).__name__, *(_plain(getattr(value, f.name)) for f in fields(value))]
+    if isinstance(value, tuple | list):
+        return [_plain(v) for v in value]
+    return value
+
+
+def _signature(file: Path) -> Any:
+    try:
+        state = file.stat()
+        with file.open("rb") as f:
+            head = f.read(4096)
+            f.seek(max(state.st_size - 4096, 0))
+            return [file.name, state.st_size, state.st_mtime_ns, crc32(head), crc32(f.read(4096))]
+    except OSError:
+        return [file.name, "unreadable"]

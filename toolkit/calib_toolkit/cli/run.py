@@ -1,0 +1,70 @@
+"""``calib-toolkit run``: from a recorded drive to its calibration."""
+
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.argument("drive", type=click.Path(path_type=Path))
+@click.option("--sensors", metavar="A,B,...", help="Sensors to calibrate, by their names in the log; all by default.")
+@click.option("-o", "--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for calibration.json.")
+@click.option("--format", "format_id", metavar="ID", help="Reader to use; without it, the one that knows DRIVE.")
+@click.option("--base", metavar="NAME", help="Sensor whose frame the poses are in; the first that has scale.")
+@click.option("--start", type=float, help="Seconds to skip.")
+@click.option("--duration", type=float, help="Seconds to use.")
+@click.option("--method", type=click.Choice(["paper"]), help="Estimator.")
+@click.option("--config", "config_file", type=click.Path(path_type=Path), help="TOML file of options.")
+@click.option("--jobs", type=click.IntRange(min=1), help="Processes; one for each core by default.")
+@click.option("--seed", type=int, help="Seed of everything random.")
+@click.option("--plugin", "plugins", multiple=True, type=click.Path(path_type=Path), help="One-file plugin.")
+@click.pass_context
+def run(
+    ctx: click.Context,
+    /,
+    drive: Path,
+    sensors: str | None,
+    out: Path | None,
+    format_id: str | None,
+    config_file: Path | None,
+    plugins: tuple[Path, ...],
+    **chosen: object,
+) -> None:
+    """Calibrate the sensors of DRIVE: where each sits, how late its clock is, and how sure that is.
+
+    Exit status 0 when everything was determined; 3 when data were skipped or a direction was not determined; 1 when
+    nothing could be told, with the reason; 2 for wrong usage.
+    """
+    from dataclasses import replace
+
+    from rich.console import Console
+
+    from calib_toolkit.cli.bars import bars
+    from calib_toolkit.cli.tables import show_result
+    from calib_toolkit.config import Config, read_config
+    from calib_toolkit.pipeline import calibrate
+    from calib_toolkit.plugins import registry
+    from calib_toolkit.result_file import write_result
+
+    given = {name: value for name, value in chosen.items() if value is not None}
+    config = replace(read_config(config_file) if config_file else Config(), **given)  # type: ignore[arg-type]
+    installed = registry(plugins)
+    log = installed.open_log(drive, format_id).select(_names(sensors))
+    with bars() as progress:
+        result = calibrate(log, config, installed, progress)
+    show_result(result, Console(highlight=False), log.reference)
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        write_result(result, out / "calibration.json")
+        click.echo(f"written: {out / 'calibration.json'}")
+    if not result.complete:
+        ctx.exit(3)
+
+
+def _names(sensors: str | None) -> list[str] | None:
+    if sensors is None:
+        return None
+    names = [n.strip() for n in sensors.split(",") if n.strip()]
+    if not names:
+        raise click.BadParameter("no sensor is named", param_hint="--sensors")
+    return names

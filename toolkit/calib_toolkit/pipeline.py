@@ -1,0 +1,151 @@
+"""From a recorded drive to a calibrated rig: the paper's section IV, stage by stage."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_toolkit import assembly, cache, observability, rotation, sync, timing, translation
+from calib_toolkit.config import Config
+from calib_toolkit.errors import ConfigError, DataError, NotObservableError
+from calib_toolkit.estimation import SensorMotion, estimate_motions
+from calib_toolkit.plugins import Registry, registry
+from calib_toolkit.progress import Progress, Silent
+from calib_toolkit.types import Log, Motions, Result, Undetermined
+
+Array = NDArray[np.float64]
+
+FEWEST_STEPS = 20
+"""Common steps below which nothing is worth estimating."""
+
+
+def open_log(path: Path | str, format_id: str | None = None) -> Log:
+    """The recording at a path, by the reader named or the one that recognises it. Raises DataError."""
+    return registry().open_log(Path(path), format_id)
+
+
+def calibrate(
+    log: Log,
+    config: Config | None = None,
+    plugins: Registry | None = None,
+    progress: Progress | None = None,
+    cache_folder: Path | None = None,
+) -> Result:
+    """Where every sensor of the log sits and how late its clock is. Raises CalibrationError.
+
+    First each sensor's own motion, then :func:`calibrate_motions`.
+    """
+    config, plugins = config or Config(), plugins or registry()
+    log = log.trim(config.start, config.duration)
+    moved = sensor_motions(log, config, plugins, progress or Silent(), cache_folder or cache.default_folder())
+    names = _base_first(moved, config.base)
+    skipped = [*log.notes, *(note for n in names for note in (*log.streams[n].notes, *moved[n].notes))]
+    clocks = [log.streams[n].clock for n in names]
+    return calibrate_motions({n: moved[n].motions for n in names}, config, clocks, skipped)
+
+
+def sensor_motions(
+    log: Log, config: Config, plugins: Registry, progress: Progress, cache_folder: Path
+) -> dict[str, SensorMotion]:
+    """Each sensor's own motion with its covariance (section V)."""
+    if len(log.streams) < 2:
+        raise DataError(
+            f"{log.source}: calibrating takes at least two sensors, and this is {', '.join(log.streams) or 'none'}; "
+            "name more with --sensors"
+        )
+    streams = [(s, plugins.sensor(s.kind, s.name)) for s in log.streams.values()]
+    return estimate_motions(streams, config.sensors, progress, config.jobs, cache_folder)
+
+
+def calibrate_motions(
+    motions: Mapping[str, Motions], config: Config, clocks: Sequence[str] = (), warnings: Sequence[str] = ()
+) -> Result:
+    """Timing, then rotation, then translation, over all sensors at once (section IV); the first is the base.
+
+    clocks: (n,) sensors that name the same clock share one offset; each its own if empty. Raises CalibrationError.
+    """
+    names = tuple(motions)
+    chains = [sync.chain(m) for m in motions.values()]
+    _check_overlap(names, chains, config.timing.max_offset)
+
+    offsets = timing.estimate(chains, clocks or names, config.timing)
+    unknown_times = observability.unmeasured_times(names, _on_base_clock(chains, offsets.dt))
+    offsets = timing.without(offsets, ~assembly.determined(names, unknown_times)[:, 6])
+
+    steps = sync.synchronise(_on_base_clock(chains, offsets.dt), config.sync.gate)
+    _check_steps(steps)
+    steps = sync.add_timing_noise(steps, offsets.cov)
+
+    rotations = rotation.estimate(steps, config.rotation)
+    unknown_turns = observability.unmeasured_turns(names, steps, rotations.R_base_sensor)
+    _check_turning(names, unknown_turns)
+
+    translations = translation.estimate(steps, rotations, config.translation)
+    unknown_shifts = observability.unmeasured_shifts(names, steps, rotations.R_base_sensor, unknown_turns)
+
+    timed = assembly.calibration(names, steps.has_scale, unknown_times, offsets)
+    turned = assembly.calibration(names, steps.has_scale, [*unknown_times, *unknown_turns], offsets, rotations)
+    unknown = [*unknown_times, *unknown_turns, *unknown_shifts]
+    placed = assembly.calibration(names, steps.has_scale, unknown, offsets, rotations, translations)
+    return Result(
+        placed,
+        {"timing": timed, "rotation": turned, "translation": placed},
+        statistics={
+            "readings": {n: len(m) for n, m in motions.items()},
+            "common_steps": len(steps),
+            "steps_rejected": steps.rejected,
+            "seconds": float(np.sum(np.diff(steps.ends, axis=1))),
+        },
+        warnings=tuple(warnings),
+        configuration=asdict(config),
+    )
+
+
+def _base_first(moved: Mapping[str, SensorMotion], base: str | None) -> list[str]:
+    """The sensors' names, the base before the others: the one chosen, or the first that has scale."""
+    if base is not None and base not in moved:
+        raise ConfigError(f"the base '{base}' is not among the sensors; there are: {', '.join(moved)}")
+    scaled = [n for n, m in moved.items() if m.motions.has_scale]
+    first = base or (scaled or list(moved))[0]
+    if scaled and first not in scaled:
+        raise ConfigError(
+            f"the base '{first}' is a camera and knows no distances; choose one of: {', '.join(scaled)}"
+        )
+    return [first, *(n for n in moved if n != first)]
+
+
+def _on_base_clock(chains: Sequence[sync.Chain], dt: Array) -> list[sync.Chain]:
+    return [c.shifted(d) for c, d in zip(chains, dt, strict=True)]
+
+
+def _check_overlap(names: Sequence[str], chains: Sequence[sync.Chain], max_offset: float) -> None:
+    start, end = sync.common_span(chains)
+    if start < end + max_offset:
+        return
+    late = names[int(np.argmax([c.knots[0] for c in chains]))]
+    early = names[int(np.argmin([c.knots[-1] for c in chains]))]
+    raise DataError(
+        f"sensor {late} starts {start - end:.1f} s after sensor {early} ends, so they never recorded together; check "
+        "that both are of the same drive and that their clocks count from the same epoch, in seconds"
+    )
+
+
+def _check_steps(steps: sync.Steps) -> None:
+    if len(steps) >= FEWEST_STEPS:
+        return
+    raise NotObservableError(
+        f"the sensors share only {len(steps)} steps, too few to calibrate from ({steps.rejected} more were dropped "
+        "because their turns disagreed by many sigma); take a longer part of the drive, or check the sensors' clocks"
+    )
+
+
+def _check_turning(names: Sequence[str], unknown: Sequence[Undetermined]) -> None:
+    """Refuse a drive that says nothing about any sensor."""
+    open_directions = [key.split(".")[0] for u in unknown for key in list(u.direction)[:1]]
+    if all(open_directions.count(name) == 3 for name in names[1:]):
+        raise NotObservableError(
+            "the vehicle hardly turned in this part of the drive, so nothing can be told of how the sensors sit; "
+            "drive bends to both sides, and a ramp, kerbs or rough ground"
+        )

@@ -1,0 +1,104 @@
+"""``calibration.json``: the result for programs, out and back in."""
+
+import json
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib_toolkit.errors import DataError
+from calib_toolkit.types import Calibration, Result, Undetermined
+from calib_toolkit.types.calibration import PARAMETERS
+
+PACKAGES = ("calib-toolkit", "numpy", "scipy", "opencv-contrib-python-headless", "open3d-cpu", "open3d", "small-gicp")
+CONVENTION = (
+    "T_base_sensor maps points in the sensor to the base; metres, radians, seconds; dt_base_sensor is added to the "
+    "sensor's stamps; rotation errors are delta in R_true = Exp(delta) R_est, base axes; null is not determined"
+)
+
+
+def write_result(result: Result, file: Path) -> None:
+    """Write a result as JSON, whole or not at all."""
+    part = file.with_suffix(".part")
+    part.write_text(json.dumps(result_dict(result), indent=1) + "\n")
+    part.replace(file)
+
+
+def result_dict(result: Result) -> dict[str, Any]:
+    """The result in plain numbers, lists and dictionaries."""
+    return {
+        "convention": CONVENTION,
+        **calibration_dict(result.calibration),
+        "stages": {name: calibration_dict(c) for name, c in result.stages.items()},
+        "statistics": dict(result.statistics),
+        "warnings": list(result.warnings),
+        "configuration": dict(result.configuration),
+        "versions": _versions(),
+    }
+
+
+def calibration_dict(c: Calibration) -> dict[str, Any]:
+    """One calibration in plain numbers; what is not determined is None."""
+    known = c.determined.ravel()
+    cov = np.where(np.outer(known, known), c.covariance, np.nan)
+    pose_known = np.ones((len(c.names), 4, 4), dtype=bool)
+    pose_known[:, :3, 3] = c.determined[:, :3]
+    poses = np.where(pose_known, c.T_base_sensor, np.nan)
+    return {
+        "base": c.base,
+        "sensors": {
+            name: {
+                "T_base_sensor": _plain(poses[i]),
+                "dt_base_sensor": _plain(np.where(c.determined[i, 6], c.dt_base_sensor[i], np.nan)),
+                "clock_skew": float(c.clock_skew[i]),
+                "t_ref": float(c.t_ref),
+                "sigma": dict(zip(PARAMETERS, _plain(c.sigma[i]), strict=True)),
+                "has_scale": bool(c.has_scale[i]),
+            }
+            for i, name in enumerate(c.names)
+        },
+        "covariance": {"order": [f"{n}.{p}" for n in c.names for p in PARAMETERS], "matrix": _plain(cov)},
+        "undetermined": [{"direction": dict(u.direction), "sentence": u.sentence} for u in c.undetermined],
+    }
+
+
+def read_calibration(file: Path) -> Calibration:
+    """The best calibration of a file that :func:`write_result` wrote. Raises DataError."""
+    try:
+        d = json.loads(file.read_text())
+        sensors = d["sensors"]
+        names = tuple(sensors)
+        sigma = np.array([[s["sigma"][p] for p in PARAMETERS] for s in sensors.values()], dtype=float)
+        return Calibration(
+            d["base"],
+            names,
+            np.array([s["T_base_sensor"] for s in sensors.values()], dtype=float),
+            np.nan_to_num(np.array([s["dt_base_sensor"] for s in sensors.values()], dtype=float)),
+            np.nan_to_num(np.array(d["covariance"]["matrix"], dtype=float)),
+            np.array([s["has_scale"] for s in sensors.values()]),
+            np.isfinite(sigma),
+            tuple(Undetermined(u["direction"], u["sentence"]) for u in d["undetermined"]),
+            np.array([s["clock_skew"] for s in sensors.values()], dtype=float),
+        )
+    except (OSError, KeyError, TypeError, ValueError) as e:
+        raise DataError(f"{file} is not a calibration this program wrote ({type(e).__name__}: {e})") from e
+
+
+def _plain(a: Any) -> Any:
+    """Nested lists, with None for nan (which JSON does not have)."""
+    a = np.asarray(a, dtype=float)
+    if a.ndim:
+        return [_plain(x) for x in a]
+    return float(a) if np.isfinite(a) else None
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
