@@ -152,10 +152,19 @@ def test_the_examples_of_the_conventions_hold(code):
     exec(code, {})
 
 
-def test_the_example_calibration_is_json_and_the_example_rigs_are_toml():
+def test_the_example_calibration_is_json_and_the_examples_of_tables_are_toml():
     assert [json.loads(block)["base"] for block in blocks("docs/formats.md", "json")] == ["velo"]
-    rigs = [tomllib.loads(b) for page in ("docs/formats.md", "README.md") for b in blocks(page, "toml")]
-    assert [list(rig) for rig in rigs] == [["sensors"]] * 2
+    rig, options = (tomllib.loads(block) for block in blocks("docs/formats.md", "toml"))
+    (first_rig,) = (tomllib.loads(block) for block in blocks("README.md", "toml"))
+    assert list(rig) == list(first_rig) == ["sensors"]
+    assert options["sensors"]
+
+
+def test_the_example_options_are_accepted(tmp_path):
+    from calib_toolkit.config import read_config
+
+    (tmp_path / "options.toml").write_text(blocks("docs/formats.md", "toml")[1])
+    assert read_config(tmp_path / "options.toml").duration == 200.0
 
 
 def test_python_in_the_readme_uses_names_that_exist():

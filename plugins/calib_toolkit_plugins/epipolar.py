@@ -100,7 +100,7 @@ def refine(prev: Points, curr: Points, R: Array, t: Array) -> tuple[Array, Array
             R, t, r, J, damping = R_new, t_new, r_new, J_new, damping / 10
         else:
             damping *= 100
-        if (gain < 1e-4 and damping < 1e-2) or damping > 1e4:  # of a cost that is one for each point
+        if abs(gain) < 1e-4 or damping > 1e4:  # of a cost that is one for each point
             break
     return R, t
 

@@ -146,7 +146,7 @@ def _module_from(file: Path) -> ModuleType:
 
 def _send_by_value(module: ModuleType) -> None:
     """Other processes can not import a loose file, so what it defines travels with the work."""
-    from joblib.externals import cloudpickle
+    import cloudpickle
 
     cloudpickle.register_pickle_by_value(module)
 
