@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from calib_toolkit.hookspecs import SensorTable as SensorTable
     from calib_toolkit.hookspecs import hookimpl as hookimpl
     from calib_toolkit.pipeline import calibrate as calibrate
+    from calib_toolkit.pipeline import calibrate_motions as calibrate_motions
     from calib_toolkit.pipeline import open_log as open_log
     from calib_toolkit.types import Calibration as Calibration
     from calib_toolkit.types import CameraIntrinsics as CameraIntrinsics
@@ -52,7 +53,7 @@ _HOMES = {
             "hookimpl",
         ),
     ],
-    "calib_toolkit.pipeline": ["calibrate", "open_log"],
+    "calib_toolkit.pipeline": ["calibrate", "calibrate_motions", "open_log"],
     "calib_toolkit.types": [
         *(
             "Calibration",

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import joblib
+import numpy as np
 
 from calib_toolkit import cache
 from calib_toolkit.errors import CalibrationError, ConfigError, DataError
@@ -136,8 +137,6 @@ def _unreadable(stream: Stream, i: int) -> str:
 
 
 def _nothing(stream: Stream) -> Motions:
-    import numpy as np
-
     return Motions(np.zeros(0), np.zeros(0), np.zeros((0, 6)), np.zeros((0, 6, 6)), stream.has_scale)
 
 
@@ -155,6 +154,11 @@ def _joined(name: str, slices: list[_Slice], parts: list[SensorMotion]) -> Senso
     if trajectories and len(trajectories) == len(motions):
         return SensorMotion(Trajectory.concatenate(trajectories), notes)
     steps = Motions.concatenate([p.motions for p in parts])
+    failed = total - 1 - len(notes) - len(steps)
+    if failed > 0 and isinstance(slices[0].stream.readings, LazyReadings):
+        notes += (
+            f"sensor {name}: no motion could be estimated for {failed} of its {total - 1} steps; they are left out",
+        )
     if not len(steps):
         raise DataError(
             f"sensor {name}: no motion could be estimated from its {total} readings; see that they show a scene "

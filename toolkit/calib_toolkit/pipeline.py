@@ -17,6 +17,7 @@ from calib_toolkit.types import Log, Motions, Result, Undetermined
 
 Array = NDArray[np.float64]
 
+STAGES = "timing, rotation, translation"
 FEWEST_STEPS = 20
 """Common steps below which nothing is worth estimating."""
 
@@ -37,13 +38,13 @@ def calibrate(
 
     First each sensor's own motion, then :func:`calibrate_motions`.
     """
-    config, plugins = config or Config(), plugins or registry()
+    config, plugins, progress = config or Config(), plugins or registry(), progress or Silent()
     log = log.trim(config.start, config.duration)
-    moved = sensor_motions(log, config, plugins, progress or Silent(), cache_folder or cache.default_folder())
+    moved = sensor_motions(log, config, plugins, progress, cache_folder or cache.default_folder())
     names = _base_first(moved, config.base)
     skipped = [*log.notes, *(note for n in names for note in (*log.streams[n].notes, *moved[n].notes))]
     clocks = [log.streams[n].clock for n in names]
-    return calibrate_motions({n: moved[n].motions for n in names}, config, clocks, skipped)
+    return calibrate_motions({n: moved[n].motions for n in names}, config, clocks, skipped, progress)
 
 
 def sensor_motions(
@@ -60,12 +61,18 @@ def sensor_motions(
 
 
 def calibrate_motions(
-    motions: Mapping[str, Motions], config: Config, clocks: Sequence[str] = (), warnings: Sequence[str] = ()
+    motions: Mapping[str, Motions],
+    config: Config | None = None,
+    clocks: Sequence[str] = (),
+    warnings: Sequence[str] = (),
+    progress: Progress | None = None,
 ) -> Result:
     """Timing, then rotation, then translation, over all sensors at once (section IV); the first is the base.
 
     clocks: (n,) sensors that name the same clock share one offset; each its own if empty. Raises CalibrationError.
     """
+    config, progress = config or Config(), progress or Silent()
+    progress.begin(STAGES, 3)
     names = tuple(motions)
     chains = [sync.chain(m) for m in motions.values()]
     _check_overlap(names, chains, config.timing.max_offset)
@@ -74,6 +81,8 @@ def calibrate_motions(
     unknown_times = observability.unmeasured_times(names, _on_base_clock(chains, offsets.dt))
     offsets = timing.without(offsets, ~assembly.determined(names, unknown_times)[:, 6])
 
+    progress.advance(STAGES, 1)
+
     steps = sync.synchronise(_on_base_clock(chains, offsets.dt), config.sync.gate)
     _check_steps(steps)
     steps = sync.add_timing_noise(steps, offsets.cov)
@@ -81,9 +90,11 @@ def calibrate_motions(
     rotations = rotation.estimate(steps, config.rotation)
     unknown_turns = observability.unmeasured_turns(names, steps, rotations.R_base_sensor)
     _check_turning(names, unknown_turns)
+    progress.advance(STAGES, 1)
 
     translations = translation.estimate(steps, rotations, config.translation)
     unknown_shifts = observability.unmeasured_shifts(names, steps, rotations.R_base_sensor, unknown_turns)
+    progress.advance(STAGES, 1)
 
     timed = assembly.calibration(names, steps.has_scale, unknown_times, offsets)
     turned = assembly.calibration(names, steps.has_scale, [*unknown_times, *unknown_turns], offsets, rotations)

@@ -7,6 +7,7 @@ The noise of a motion gathers evenly over its duration: a part of a step carries
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,16 @@ class Chain:
     def period(self) -> float:
         """Median duration of the known links, seconds."""
         return float(np.median(np.diff(self.knots)[self.known]))
+
+    @cached_property
+    def turned(self) -> PPoly:
+        """The rotation in ``summed`` alone, (3,) at any stamp."""
+        return PPoly(self.summed.c[:, :, 3:], self.knots)
+
+    @cached_property
+    def gathered(self) -> Array:
+        """(m + 1, 2) variance of the angle and time not known, added up to each knot."""
+        return _added_up(np.column_stack([angle_variance(self.vec[:, 3:], self.cov[:, 3:, 3:]), _unknown(self)]))
 
     def shifted(self, dt: float) -> "Chain":
         """The same chain on a clock that reads ``dt`` seconds more."""
@@ -84,18 +95,26 @@ def chain(motions: Motions) -> Chain:
     return Chain(knots, vec, cov, known, m.has_scale, _summed(knots, vec, known))
 
 
-def common_span(chains: Sequence[Chain]) -> tuple[float, float]:
-    """First and last instant that every sensor covers, seconds; empty when the first is not before the last."""
-    return max(float(c.knots[0]) for c in chains), min(float(c.knots[-1]) for c in chains)
+def common_span(chains: Sequence[Chain], dt: Array | None = None) -> tuple[float, float]:
+    """First and last instant that every sensor covers, seconds; empty when the first is not before the last.
+
+    dt: (n,) added to each sensor's stamps, zero if None.
+    """
+    later = np.zeros(len(chains)) if dt is None else dt
+    first, last = (np.array([c.knots[end] for c in chains]) + later for end in (0, -1))
+    return float(first.max()), float(last.min())
 
 
-def angles(chains: Sequence[Chain], stamps: Array) -> tuple[Array, Array]:
+def angles(chains: Sequence[Chain], stamps: Array, dt: Array | None = None) -> tuple[Array, Array]:
     """Angle through which each sensor turns between successive stamps, with its variance.
 
-    stamps: (m + 1,) seconds. Returns (n, m) radians and (n, m) radians squared; nan where a sensor's motion
-    is not known. Within a step shorter than a reading rotations commute to second order, so they are summed.
+    stamps: (m + 1,) seconds of base time. dt: (n,) added to each sensor's stamps to get base time, zero if None.
+    Returns (n, m) radians and (n, m) radians squared; nan where a sensor's motion is not known. Within a step
+    shorter than a reading rotations commute to second order, so they are summed.
     """
-    found = [_angles_of(c, stamps) for c in chains]
+    found = [
+        _angles_of(c, stamps - d) for c, d in zip(chains, np.zeros(len(chains)) if dt is None else dt, strict=True)
+    ]
     return np.array([a for a, _ in found]), np.array([v for _, v in found])
 
 
@@ -179,14 +198,13 @@ def _summed(knots: Array, vec: Array, known: Mask) -> PPoly:
 
 
 def _angles_of(c: Chain, stamps: Array) -> tuple[Array, Array]:
-    rotvec = np.diff(c.summed(stamps), axis=0)[:, 3:]
-    per_link = np.column_stack([angle_variance(c.vec[:, 3:], c.cov[:, 3:, 3:]), _unknown(c)])
-    step = np.diff(_gathered(c, per_link, stamps), axis=0)
+    rotvec = np.diff(c.turned(stamps), axis=0)
+    variance, unknown = (np.diff(np.interp(stamps, c.knots, column)) for column in c.gathered.T)
     outside = (stamps < c.knots[0] - SAME_STAMP) | (stamps > c.knots[-1] + SAME_STAMP)
-    bad = (step[:, 1] > SAME_STAMP) | outside[:-1] | outside[1:]
+    bad = (unknown > SAME_STAMP) | outside[:-1] | outside[1:]
     return (
-        np.where(bad, np.nan, np.linalg.norm(rotvec, axis=1)),
-        np.where(bad, np.nan, np.maximum(step[:, 0], 1e-18)),
+        np.where(bad, np.nan, np.sqrt(np.einsum("mi,mi->m", rotvec, rotvec))),
+        np.where(bad, np.nan, np.maximum(variance, 1e-18)),
     )
 
 
@@ -194,8 +212,11 @@ def _between(c: Chain, ends: Array) -> tuple[Array, Array, Mask]:
     """Motion of one sensor over each (start, end), its covariance, and whether it is known throughout."""
     poses = _poses(c, ends.ravel()).reshape(-1, 2, 4, 4)
     vec = se3.vector(se3.relative(poses[:, 0], poses[:, 1]))
-    per_link = np.concatenate([c.cov.reshape(-1, 36), _unknown(c)[:, None]], axis=1)
-    step = np.diff(_gathered(c, per_link, ends.ravel()).reshape(-1, 2, 37), axis=1)[:, 0]
+    gathered = _added_up(np.concatenate([c.cov.reshape(-1, 36), _unknown(c)[:, None]], axis=1))
+    link = _link(c, ends.ravel())
+    part = np.clip((ends.ravel() - c.knots[link]) / (c.knots[link + 1] - c.knots[link]), 0.0, 1.0)
+    at_ends = gathered[link] + part[:, None] * (gathered[link + 1] - gathered[link])
+    step = np.diff(at_ends.reshape(-1, 2, 37), axis=1)[:, 0]
     if not c.has_scale:
         length = np.linalg.norm(vec[:, :3], axis=1, keepdims=True)
         vec[:, :3] /= np.maximum(length, 1e-12)
@@ -207,12 +228,9 @@ def _unknown(c: Chain) -> Array:
     return np.where(c.known, 0.0, np.diff(c.knots))
 
 
-def _gathered(c: Chain, per_link: Array, stamps: Array) -> Array:
-    """What the links (m, q) add up to by each stamp, a part of a link adding its part. (k, q)."""
-    total = np.vstack([np.zeros(per_link.shape[1]), np.cumsum(per_link, axis=0)])
-    link = _link(c, stamps)
-    part = np.clip((stamps - c.knots[link]) / (c.knots[link + 1] - c.knots[link]), 0.0, 1.0)
-    return total[link] + part[:, None] * per_link[link]
+def _added_up(per_link: Array) -> Array:
+    """What the links (m, q) add up to at each knot, (m + 1, q)."""
+    return np.vstack([np.zeros(per_link.shape[1]), np.cumsum(per_link, axis=0)])
 
 
 def _link(c: Chain, stamps: Array) -> NDArray[np.int64]:

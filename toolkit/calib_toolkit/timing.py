@@ -90,7 +90,7 @@ def uncertainty(dt: Array, chains: Sequence[Chain], groups: Array, options: Timi
     """Covariance (q, q) of the clocks' offsets: the larger of Cramer-Rao and the approximate delta method (VI-D1)."""
     full = _spread(dt, groups)
     angle, variance = _angles(full, chains, options.steps)
-    lo, hi = common_span([c.shifted(d) for c, d in zip(chains, full, strict=True)])
+    lo, hi = common_span(chains, full)
     slope = np.gradient(angle, (hi - lo) / options.steps, axis=1)
     to_clock = _to_clock(groups)
     sums = delta.Sums.zero(dt.size, len(chains), options.steps)
@@ -106,13 +106,12 @@ def uncertainty(dt: Array, chains: Sequence[Chain], groups: Array, options: Timi
 
 
 def _angles(dt: Array, chains: Sequence[Chain], steps: int) -> tuple[Array, Array]:
-    moved = [c.shifted(d) for c, d in zip(chains, dt, strict=True)]
-    lo, hi = common_span(moved)
+    lo, hi = common_span(chains, dt)
     if hi <= lo:
         raise NotObservableError(
             "the sensors' recordings do not overlap in time; check their clocks and that they are of one drive"
         )
-    return angles(moved, np.linspace(lo, hi, steps + 1))
+    return angles(chains, np.linspace(lo, hi, steps + 1), dt)
 
 
 def _groups(clocks: Sequence[Hashable]) -> Array:

@@ -12,6 +12,7 @@ step (equation 16). Pairs without any scale are skipped.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,12 +153,11 @@ class Term:
         length = self.length(rest)
         turned = self.by_lever @ lever
         cov = self.cov_rest + length**2 * self.cov_y + self.by_lever_squared @ np.outer(lever, lever).ravel()
-        cov = (cov + (length * turned if self.turned_by == self.y else -turned)).reshape(-1, 3, 3)
+        cov = cov + (length * turned if self.turned_by == self.y else -turned)
         if self.unscaled:
-            u = self.p_y
-            variance = np.einsum("mi,mij,mj->m", u, cov, u) / self._squared**2
-            cov = cov + variance[:, None, None] * (u[:, :, None] * u[:, None, :])
-        return rest + length * self.p_y, cov
+            # the solved length is uncertain too: variance of s, along p_y
+            cov = cov + (np.einsum("mk,mk->m", self._outer, cov) / self._squared**2)[:, None] * self._outer
+        return rest + length * self.p_y, cov.reshape(-1, 3, 3)
 
     def length(self, rest: Array) -> Array:
         """(m, 1) of y's translation: one, or what brings equation (16) nearest to zero."""
@@ -165,9 +165,13 @@ class Term:
             return np.ones((len(rest), 1))
         return (-np.einsum("mi,mi->m", self.p_y, rest) / self._squared)[:, None]
 
-    @property
+    @cached_property
     def _squared(self) -> Array:
         return np.maximum(np.einsum("mi,mi->m", self.p_y, self.p_y), 1e-12)
+
+    @cached_property
+    def _outer(self) -> Array:
+        return np.einsum("mi,mj->mij", self.p_y, self.p_y).reshape(-1, 9)
 
     def jacobians(self, lever: Array) -> tuple[Array, Array, Array]:
         """Derivatives by the lever (m, 3, 3) and by x's and y's readings ``(p, delta)`` (m, 3, 6) each."""
