@@ -27,7 +27,8 @@ def larger(a: Array, b: Array) -> Array:
     """For each parameter the larger of two variances, with the correlations of the second (VI-D1). (q, q) each."""
     sigma_b = np.sqrt(np.diag(b))
     sigma = np.sqrt(np.maximum(np.diag(a), np.diag(b)))
-    correlation = b / np.outer(sigma_b, sigma_b)
+    scale = np.outer(sigma_b, sigma_b)
+    correlation = np.divide(b, scale, out=np.eye(len(b)), where=scale > 0)  # nothing may pull at a parameter
     return correlation * np.outer(sigma, sigma)
 
 

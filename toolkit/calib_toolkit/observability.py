@@ -6,7 +6,7 @@ are independent, so it is zero on average wherever nothing moved. A direction co
 excitation stands so many standard deviations above zero, with the spread taken from the steps themselves.
 """
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,23 +23,27 @@ TIME_THRESHOLD = 5.0
 """The same for time, where the offset was chosen among hundreds for its agreement."""
 
 
-def unmeasured_times(names: Sequence[str], chains: Sequence[Chain]) -> list[Undetermined]:
-    """Sensors whose angular speed does not change together with the first's. chains: on one clock."""
+def unmeasured_times(names: Sequence[str], chains: Sequence[Chain], clocks: Sequence[Hashable]) -> list[Undetermined]:
+    """Sensors on clocks of which none's angular speed changes together with the first sensor's.
+
+    chains: (n,) on one clock. clocks: (n,) sensors with equal ones share an offset.
+    """
     lo, hi = common_span(chains)
-    angle, _ = angles(chains, np.arange(lo, hi, max(c.period for c in chains)))
+    window = max(c.period for c in chains)
+    angle, _ = angles(chains, np.arange(lo, hi - window, window), window)
     slope = np.diff(angle, axis=1)
-    found = []
-    for name, other in zip(names[1:], slope[1:], strict=True):
-        product = (slope[0] * other)[np.isfinite(slope[0] * other)]
-        if product.sum() <= TIME_THRESHOLD * np.sqrt((product**2).sum()):
-            found.append(
-                Undetermined(
-                    {f"{name}.dt": 1.0},
-                    f"the clock offset of {name} was not determined and is taken as zero: the vehicle's turning "
-                    "hardly changed; drive bends at changing speed",
-                )
-            )
-    return found
+    product = slope[0] * slope
+    score = np.nansum(product, axis=1) / np.sqrt(np.nansum(product**2, axis=1)).clip(1e-300)
+    measured = {clocks[0], *(c for c, s in zip(clocks, score, strict=True) if s > TIME_THRESHOLD)}
+    return [
+        Undetermined(
+            {f"{name}.dt": 1.0},
+            f"the clock offset of {name} was not determined and is taken as zero: the vehicle's turning hardly "
+            "changed; drive bends at changing speed",
+        )
+        for name, clock in zip(names, clocks, strict=True)
+        if clock not in measured
+    ]
 
 
 def unmeasured_turns(names: Sequence[str], steps: Steps, R: Array) -> list[Undetermined]:

@@ -77,8 +77,9 @@ def calibrate_motions(
     chains = [sync.chain(m) for m in motions.values()]
     _check_overlap(names, chains, config.timing.max_offset)
 
-    offsets = timing.estimate(chains, clocks or names, config.timing)
-    unknown_times = observability.unmeasured_times(names, _on_base_clock(chains, offsets.dt))
+    clocks = clocks or names
+    offsets = timing.estimate(chains, clocks, config.timing)
+    unknown_times = observability.unmeasured_times(names, _on_base_clock(chains, offsets.dt), clocks)
     offsets = timing.without(offsets, ~assembly.determined(names, unknown_times)[:, 6])
 
     progress.advance(STAGES, 1)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from calib_toolkit import delta, se3
 from calib_toolkit.likelihood import all_pairs, log_normal_3d, maximise, trimmed
@@ -89,5 +88,5 @@ def _in_base_axes(R: Array, steps: Steps) -> tuple[Array, Array]:
 
 
 def _kabsch(w_base: Array, w_sensor: Array, weight: Array) -> Array:
-    turn, _ = Rotation.align_vectors(w_base, w_sensor, weights=weight / weight.sum())
-    return turn.as_matrix()
+    U, _, Vt = np.linalg.svd((w_base * weight[:, None]).T @ w_sensor)
+    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt

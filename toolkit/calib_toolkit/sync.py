@@ -105,15 +105,16 @@ def common_span(chains: Sequence[Chain], dt: Array | None = None) -> tuple[float
     return float(first.max()), float(last.min())
 
 
-def angles(chains: Sequence[Chain], stamps: Array, dt: Array | None = None) -> tuple[Array, Array]:
-    """Angle through which each sensor turns between successive stamps, with its variance.
+def angles(chains: Sequence[Chain], stamps: Array, window: float, dt: Array | None = None) -> tuple[Array, Array]:
+    """Angle through which each sensor turns in the window that begins at each stamp, with its variance.
 
-    stamps: (m + 1,) seconds of base time. dt: (n,) added to each sensor's stamps to get base time, zero if None.
-    Returns (n, m) radians and (n, m) radians squared; nan where a sensor's motion is not known. Within a step
-    shorter than a reading rotations commute to second order, so they are summed.
+    stamps: (m,) and window: seconds of base time. dt: (n,) added to each sensor's stamps to get base time, zero if
+    None. Returns (n, m) radians and (n, m) radians squared; nan where a sensor's motion is not known. Within so
+    short a window rotations commute to second order, so they are summed.
     """
     found = [
-        _angles_of(c, stamps - d) for c, d in zip(chains, np.zeros(len(chains)) if dt is None else dt, strict=True)
+        _angles_of(c, stamps - d, window)
+        for c, d in zip(chains, np.zeros(len(chains)) if dt is None else dt, strict=True)
     ]
     return np.array([a for a, _ in found]), np.array([v for _, v in found])
 
@@ -197,11 +198,11 @@ def _summed(knots: Array, vec: Array, known: Mask) -> PPoly:
     return PPoly(c, knots)
 
 
-def _angles_of(c: Chain, stamps: Array) -> tuple[Array, Array]:
-    rotvec = np.diff(c.turned(stamps), axis=0)
-    variance, unknown = (np.diff(np.interp(stamps, c.knots, column)) for column in c.gathered.T)
-    outside = (stamps < c.knots[0] - SAME_STAMP) | (stamps > c.knots[-1] + SAME_STAMP)
-    bad = (unknown > SAME_STAMP) | outside[:-1] | outside[1:]
+def _angles_of(c: Chain, start: Array, window: float) -> tuple[Array, Array]:
+    end = start + window
+    rotvec = c.turned(end) - c.turned(start)
+    variance, unknown = (np.interp(end, c.knots, g) - np.interp(start, c.knots, g) for g in c.gathered.T)
+    bad = (unknown > SAME_STAMP) | (start < c.knots[0] - SAME_STAMP) | (end > c.knots[-1] + SAME_STAMP)
     return (
         np.where(bad, np.nan, np.sqrt(np.einsum("mi,mi->m", rotvec, rotvec))),
         np.where(bad, np.nan, np.maximum(variance, 1e-18)),
@@ -217,10 +218,14 @@ def _between(c: Chain, ends: Array) -> tuple[Array, Array, Mask]:
     part = np.clip((ends.ravel() - c.knots[link]) / (c.knots[link + 1] - c.knots[link]), 0.0, 1.0)
     at_ends = gathered[link] + part[:, None] * (gathered[link + 1] - gathered[link])
     step = np.diff(at_ends.reshape(-1, 2, 37), axis=1)[:, 0]
+    cov = step[:, :36].reshape(-1, 6, 6)
     if not c.has_scale:
         length = np.linalg.norm(vec[:, :3], axis=1, keepdims=True)
-        vec[:, :3] /= np.maximum(length, 1e-12)
-    return vec, step[:, :36].reshape(-1, 6, 6), step[:, 36] <= SAME_STAMP
+        unit = np.ones_like(vec)
+        unit[:, :3] = 1 / np.maximum(length, 1e-12)
+        vec *= unit
+        cov *= unit[:, :, None] * unit[:, None, :]
+    return vec, cov, step[:, 36] <= SAME_STAMP
 
 
 def _unknown(c: Chain) -> Array:

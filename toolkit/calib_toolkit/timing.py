@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TimingOptions:
-    """steps: how many equal steps the drive is cut into (VI-A1). trim: share of each pair left out (VI-C1).
+    """steps: at how many instants the sensors are compared (VI-A1). trim: share of each pair left out (VI-C1).
 
     start: ``correlation`` of the angular speeds, or ``zero`` as in the paper. max_offset: seconds.
     """
@@ -40,13 +40,44 @@ class TimeOffsets:
     cov: Array
 
 
+@dataclass(frozen=True)
+class Grid:
+    """Instants at which angles are compared, each over a window of two readings of the slowest sensor.
+
+    Within a reading the rate of turn is not known, and what an interpolation makes of it depends on where the
+    stamps lie, which draws those of two sensors together; over two readings that averages out.
+    """
+
+    stamps: Array
+    window: float
+
+    @property
+    def independent(self) -> float:
+        """Windows overlap: how many independent ones each stands for."""
+        return min(float(self.stamps[1] - self.stamps[0]) / self.window, 1.0)
+
+
 def estimate(chains: Sequence[Chain], clocks: Sequence[Hashable], options: TimingOptions) -> TimeOffsets:
     """Offsets of all sensors to the first. clocks: (n,) sensors with equal ones share one offset."""
     groups = _groups(clocks)
     start = initialise(chains, options)[_first_of(groups)]
-    dt = optimise(start, chains, groups, options)
+    over = grid(chains, _spread(start, groups), options.steps)
+    dt = optimise(start, chains, groups, over, options.trim)
     to_clock = _to_clock(groups)
-    return TimeOffsets(_spread(dt, groups), to_clock @ uncertainty(dt, chains, groups, options) @ to_clock.T)
+    cov = to_clock @ uncertainty(dt, chains, groups, over, options.trim) @ to_clock.T
+    return TimeOffsets(_spread(dt, groups), cov)
+
+
+def grid(chains: Sequence[Chain], dt: Array, steps: int) -> Grid:
+    """Equally spaced instants (VI-A1) over the time that all sensors cover. dt: (n,). Raises NotObservableError."""
+    window = 2 * max(c.period for c in chains)
+    start, end = common_span(chains, dt)
+    if end - start <= 2 * window:
+        raise NotObservableError(
+            "the sensors' recordings hardly overlap in time; check their clocks, that they are of one drive, and "
+            "that the part chosen is long enough"
+        )
+    return Grid(np.linspace(start, end - window, steps), window)
 
 
 def without(offsets: TimeOffsets, unknown: NDArray[np.bool_]) -> TimeOffsets:
@@ -63,55 +94,47 @@ def initialise(chains: Sequence[Chain], options: TimingOptions) -> Array:
     return np.array([0.0, *(_lag(chains[0], c, options.max_offset) for c in chains[1:])])
 
 
-def log_likelihood(dt: Array, chains: Sequence[Chain], options: TimingOptions) -> float:
+def log_likelihood(dt: Array, chains: Sequence[Chain], grid: Grid, trim: float) -> float:
     """Equations (9) and (17): trimmed sum over all pairs that the angles of both are the same. dt: (n,)."""
-    angle, variance = _angles(dt, chains, options.steps)
+    angle, variance = angles(chains, grid.stamps, grid.window, dt)
     total = 0.0
     for x, y in all_pairs(len(chains)):
         known = np.isfinite(angle[x] + angle[y])
+        if not known.any():
+            return -np.inf
         each = log_normal((angle[x] - angle[y])[known], (variance[x] + variance[y])[known])
-        # the mean, since how many steps overlap depends on the offsets
-        total += trimmed(each, options.trim)[0] / max(len(each), 1) * options.steps
+        # the mean, since how many windows both cover depends on the offsets
+        total += trimmed(each, trim)[0] / len(each) * grid.independent * len(grid.stamps)
     return total
 
 
-def optimise(start: Array, chains: Sequence[Chain], groups: Array, options: TimingOptions) -> Array:
+def optimise(start: Array, chains: Sequence[Chain], groups: Array, grid: Grid, trim: float) -> Array:
     """The offsets of highest likelihood, one per clock that is not the base's. start: (q,)."""
 
     def likelihood(dt: Array) -> float:
-        return log_likelihood(_spread(dt, groups), chains, options)
+        return log_likelihood(_spread(dt, groups), chains, grid, trim)
 
     # the start may be a reading off, which is many sigma: coarse, then fine
     near = maximise(likelihood, start, np.eye(start.size) * (min(c.period for c in chains) / 4) ** 2)
-    return maximise(likelihood, near, uncertainty(near, chains, groups, options))
+    return maximise(likelihood, near, uncertainty(near, chains, groups, grid, trim))
 
 
-def uncertainty(dt: Array, chains: Sequence[Chain], groups: Array, options: TimingOptions) -> Array:
+def uncertainty(dt: Array, chains: Sequence[Chain], groups: Array, grid: Grid, trim: float) -> Array:
     """Covariance (q, q) of the clocks' offsets: the larger of Cramer-Rao and the approximate delta method (VI-D1)."""
-    full = _spread(dt, groups)
-    angle, variance = _angles(full, chains, options.steps)
-    lo, hi = common_span(chains, full)
-    slope = np.gradient(angle, (hi - lo) / options.steps, axis=1)
+    angle, variance = angles(chains, grid.stamps, grid.window, _spread(dt, groups))
+    slope = np.gradient(angle, grid.stamps, axis=1)
     to_clock = _to_clock(groups)
-    sums = delta.Sums.zero(dt.size, len(chains), options.steps)
+    sums = delta.Sums.zero(dt.size, len(chains), len(grid.stamps))
     for x, y in all_pairs(len(chains)):
         known = np.isfinite(angle[x] + angle[y] + slope[x] + slope[y])
         error, spread2 = (angle[x] - angle[y])[known], (variance[x] + variance[y])[known]
-        kept = np.flatnonzero(known)[trimmed(log_normal(error, spread2), options.trim)[1]]
+        kept = np.flatnonzero(known)[trimmed(log_normal(error, spread2), trim)[1]]
         # a later clock shows an earlier angle: d angle(t - dt) / d dt = -slope
         J = -slope[x, kept, None] * to_clock[x] + slope[y, kept, None] * to_clock[y]
-        weight = 1.0 / (variance[x, kept] + variance[y, kept])
+        weight = grid.independent / (variance[x, kept] + variance[y, kept])
         sums.add(kept, x, y, J[:, None, :], weight[:, None, None], np.ones((1, 1)), -np.ones((1, 1)))
-    return delta.larger(sums.cramer_rao(), sums.approximate_delta(variance[:, :, None, None]))
-
-
-def _angles(dt: Array, chains: Sequence[Chain], steps: int) -> tuple[Array, Array]:
-    lo, hi = common_span(chains, dt)
-    if hi <= lo:
-        raise NotObservableError(
-            "the sensors' recordings do not overlap in time; check their clocks and that they are of one drive"
-        )
-    return angles(chains, np.linspace(lo, hi, steps + 1), dt)
+    noise = variance[:, :, None, None] / grid.independent
+    return delta.larger(sums.cramer_rao(), sums.approximate_delta(noise))
 
 
 def _groups(clocks: Sequence[Hashable]) -> Array:
@@ -141,6 +164,8 @@ def _lag(base: Chain, other: Chain, max_offset: float) -> float:
     score = correlate(a, b, method="fft")
     shift = np.arange(len(score)) - (len(b) - 1)
     dt = starts[0] - starts[1] + shift * tick
+    if not a.any() or not b.any():
+        return 0.0  # one of them never turned
     energy = correlate(a**2, np.ones(len(b)), method="fft") * correlate(np.ones(len(a)), b**2, method="fft")
     allowed = (np.abs(dt) <= max_offset) & (energy > 1e-3 * energy.max())
     if not allowed.any():
@@ -152,7 +177,7 @@ def _lag(base: Chain, other: Chain, max_offset: float) -> float:
 
 
 def _speed(c: Chain, tick: float) -> tuple[Array, float]:
-    stamps = np.arange(c.knots[0], c.knots[-1], tick)
-    angle, _ = angles([c], stamps)
+    stamps = np.arange(c.knots[0], c.knots[-1] - tick, tick)
+    angle, _ = angles([c], stamps, tick)
     known = np.isfinite(angle[0])
     return np.where(known, angle[0], np.mean(angle[0], where=known)), float(stamps[0])

@@ -149,10 +149,11 @@ class Term:
 
     def residual(self, lever: Array) -> tuple[Array, Array]:
         """Equation (14) or (16), (m, 3), and its covariance by the delta method, (m, 3, 3)."""
-        rest = self.D @ lever - self.p_x
+        rest = _times(self.D, lever) - self.p_x
         length = self.length(rest)
-        turned = self.by_lever @ lever
-        cov = self.cov_rest + length**2 * self.cov_y + self.by_lever_squared @ np.outer(lever, lever).ravel()
+        turned = _times(self.by_lever, lever)
+        cov = self.cov_rest + length**2 * self.cov_y
+        cov = cov + _times(self.by_lever_squared, np.outer(lever, lever).ravel())
         cov = cov + (length * turned if self.turned_by == self.y else -turned)
         if self.unscaled:
             # the solved length is uncertain too: variance of s, along p_y
@@ -235,6 +236,11 @@ def _from_turns(term: Term, motion: Turned, lever: Array) -> Array:
     J = np.concatenate(parts, axis=2)
     rows = np.r_[3 * term.x : 3 * term.x + 3, 3 * term.y : 3 * term.y + 3]
     return (J @ motion.cov_turns[np.ix_(rows, rows)] @ np.swapaxes(J, 1, 2)).reshape(-1, 9)
+
+
+def _times(stack: Array, vector: Array) -> Array:
+    """(m, a, b) @ (b,) as one matrix-vector product, which is what makes an evaluation fast."""
+    return (stack.reshape(-1, len(vector)) @ vector).reshape(stack.shape[:2])
 
 
 def _sums(t: Array, terms: Sequence[Term], options: TranslationOptions) -> delta.Sums:
