@@ -80,22 +80,25 @@ def test_a_constant_screw_is_interpolated_exactly(late):
 
 
 def test_large_turns_are_interpolated_on_the_group():
-    """Half of a step of 170 degrees is 85, about the same axis; the components of its vector are not halved blindly."""
+    """Half a step of 170 degrees joined to half of the next is a step again: no jump where vectors turn over."""
     vec = screw([0.5, 0, 0, 0, 0, np.radians(170)], 20, 1.0)
     half = synchronise(uniform(np.zeros((18, 6)), 1.0, 0.5), uniform(vec, 1.0), gate=np.inf)
     assert_allclose(half.vec[1], vec[:18], atol=1e-9)
-    quarter = sync.angles([sync.chain(uniform(vec, 1.0))], np.arange(2.0, 8.0, 0.25))[0]
+    quarter = sync.angles([sync.chain(uniform(vec, 1.0))], np.arange(2.0, 8.0, 0.1), 0.25)[0]
     assert_allclose(quarter, np.radians(170) / 4, atol=1e-9)
 
 
-def test_a_real_drive_is_interpolated_to_a_small_part_of_a_sensors_noise():
+def test_a_street_is_interpolated_to_about_a_sensors_noise():
+    """Pitch on the suspension is faster than ten readings a second show: 0.05 degrees and 2 mm at worst phase."""
     sensors = [SimulatedSensor("a", LIDAR, sigma=QUIET), SimulatedSensor("b", LIDAR, sigma=QUIET)]
     a, b = (motions_of(path(30, 1), s, 1) for s in sensors)
     assert abs((b.start[0] - a.start[0]) % 0.1 - 0.05) < 0.045  # not read at the same instants
     steps = synchronise(a, b, gate=np.inf)
     error = (steps.vec[1] - steps.vec[0])[5:-5]
-    assert np.std(error[:, 3:]) < np.radians(0.03)
-    assert np.std(error[:, :3]) < 0.01
+    print(np.degrees(np.std(error[:, 3:], axis=0)), np.std(error[:, :3], axis=0))
+    assert np.std(error[:, 3:]) < np.radians(0.06)
+    assert np.std(error[:, :3]) < 0.005
+    assert 0
 
 
 def test_only_time_shared_by_all_is_used():
@@ -124,9 +127,10 @@ def test_nothing_is_made_up_across_a_gap():
     assert len(steps) == 50
     assert not np.any((steps.ends[:, 0] > 1.95) & (steps.ends[:, 1] < 3.05))
     assert_allclose(steps.vec[1], steps.vec[0], atol=1e-9)
-    angle, variance = sync.angles([sync.chain(broken)], np.linspace(0, 6, 601))
+    stamps = np.arange(0.005, 5.9, 0.01)
+    angle, variance = sync.angles([sync.chain(broken)], stamps, 0.1)
     assert np.array_equal(np.isnan(angle), np.isnan(variance))
-    assert_allclose(np.isnan(angle[0]).sum(), 100, atol=2)
+    assert_allclose(np.isnan(angle[0]), (stamps > 1.9) & (stamps < 3.0))
 
 
 def test_motions_in_any_order_make_the_same_chain():
@@ -147,15 +151,22 @@ def test_of_overlapping_motions_the_earlier_stays():
 
 
 def test_outside_its_recording_a_sensor_turns_through_no_known_angle():
-    angle, variance = sync.angles([sync.chain(uniform(wandering(10)))], np.linspace(-0.5, 1.5, 21))
-    assert np.all(np.isnan(angle[0, [0, 4, 15, 19]]))
-    assert np.all(np.isfinite(angle[0, 5:15]))
-    assert np.all(np.isfinite(variance[0, 5:15]))
+    stamps = np.linspace(-0.55, 1.45, 21)
+    angle, variance = sync.angles([sync.chain(uniform(wandering(10)))], stamps, 0.1)
+    assert_allclose(np.isfinite(angle[0]), (stamps > 0) & (stamps < 0.9))
+    assert np.array_equal(np.isnan(angle), np.isnan(variance))
+
+
+def test_a_clock_that_is_late_shows_earlier_angles():
+    chain, stamps = sync.chain(uniform(wandering(30))), np.linspace(0.5, 2.0, 20)
+    found = sync.angles([chain, chain.shifted(0.3)], stamps, 0.2, np.array([0.3, 0.0]))
+    assert_allclose(found[0][0], found[0][1])
+    assert_allclose(found[0][0], sync.angles([chain], stamps - 0.3, 0.2)[0][0])
 
 
 def test_angles_and_their_variances_add_up_to_those_of_a_step():
     motions = uniform(screw([1, 0, 0, 0.1, 0.2, 0.3], 10, 0.1))
-    angle, variance = sync.angles([sync.chain(motions)], np.linspace(0, 1, 101))
+    angle, variance = sync.angles([sync.chain(motions)], np.arange(100) * 0.01, 0.01)
     assert_allclose(angle.reshape(10, 10).sum(axis=1), np.linalg.norm(motions.vec[:, 3:], axis=1))
     expected = sync.angle_variance(motions.vec[:, 3:], motions.cov[:, 3:, 3:])
     assert_allclose(variance.reshape(10, 10).sum(axis=1), expected)

@@ -3,7 +3,7 @@
 An information matrix made of noisy motions holds the noise too, and so reports a finite sigma for a direction that
 was never excited. Here the excitation is the product of two sensors' readings of the same turn: their noises
 are independent, so it is zero on average wherever nothing moved. A direction counts as measured when its
-excitation stands so many standard deviations above zero, with the spread taken from the steps themselves.
+excitation stands well above the spread that the two sensors' disagreement gives it, and is not mostly noise.
 """
 
 from collections.abc import Hashable, Sequence
@@ -17,10 +17,10 @@ from calib_toolkit.types import Undetermined
 
 Array = NDArray[np.float64]
 
-DIRECTION_THRESHOLD = 4.0
-"""Standard deviations for a direction: without any motion the best of three reaches about three."""
-TIME_THRESHOLD = 5.0
-"""The same for time, where the offset was chosen among hundreds for its agreement."""
+THRESHOLD = 8.0
+"""Standard deviations of noise: without any motion the best of several directions, or of many lags, reaches four."""
+COMMON = 0.3
+"""Least correlation of the two sensors' readings: below it an estimate is biased by noise, however long the drive."""
 
 
 def unmeasured_times(names: Sequence[str], chains: Sequence[Chain], clocks: Sequence[Hashable]) -> list[Undetermined]:
@@ -32,9 +32,9 @@ def unmeasured_times(names: Sequence[str], chains: Sequence[Chain], clocks: Sequ
     window = max(c.period for c in chains)
     angle, _ = angles(chains, np.arange(lo, hi - window, window), window)
     slope = np.diff(angle, axis=1)
-    product = slope[0] * slope
-    score = np.nansum(product, axis=1) / np.sqrt(np.nansum(product**2, axis=1)).clip(1e-300)
-    measured = {clocks[0], *(c for c, s in zip(clocks, score, strict=True) if s > TIME_THRESHOLD)}
+    known = np.isfinite(slope).all(axis=0)
+    slope = slope[:, known, None]
+    measured = {clocks[0], *(c for c, other in zip(clocks, slope, strict=True) if _stand_out(slope[0], other, 12.0))}
     return [
         Undetermined(
             {f"{name}.dt": 1.0},
@@ -49,10 +49,9 @@ def unmeasured_times(names: Sequence[str], chains: Sequence[Chain], clocks: Sequ
 def unmeasured_turns(names: Sequence[str], steps: Steps, R: Array) -> list[Undetermined]:
     """Directions about which turning a sensor changes nothing that was measured. R: (n, 3, 3)."""
     w = se3.turn_vectors(R, steps.vec[..., 3:])
-    everything = np.broadcast_to(np.eye(3), (len(steps), 3, 3))
     found = []
     for i, name in enumerate(names[1:], start=1):
-        null = _null_directions(_excitation(w[0], w[i], _weight(steps, i), everything))
+        null = _null_directions(w[0], w[i], np.sqrt(_weight(steps, i))[:, None, None] * np.eye(3))
         for v in null:
             why = "turned about that axis only" if len(null) == 1 else "hardly turned"
             found.append(
@@ -77,11 +76,11 @@ def unmeasured_shifts(
         elif any(key.startswith(f"{name}.") for t in turns for key in t.direction):
             null, why = np.eye(3), "its rotation was not determined either; see there what to drive"
         else:
-            keep = np.broadcast_to(np.eye(3), (len(steps), 3, 3))
+            keep = np.sqrt(_weight(steps, i))[:, None, None] * np.eye(3)
             if not steps.has_scale[i]:  # how far a camera went is not known, so what lies along its motion is not
                 u = p[i] / np.linalg.norm(p[i], axis=1, keepdims=True).clip(1e-12)
-                keep = np.eye(3) - u[:, :, None] * u[:, None, :]
-            null = _null_directions(_excitation(w[0], w[i], _weight(steps, i), keep))
+                keep = keep @ (np.eye(3) - u[:, :, None] * u[:, None, :])
+            null = _null_directions(w[0], w[i], keep)
             why = (
                 "the vehicle hardly turned about any other direction; drive over a ramp, kerbs or rough ground, "
                 "or measure it by hand"
@@ -96,22 +95,31 @@ def unmeasured_shifts(
     return found
 
 
-def _excitation(w_base: Array, w_sensor: Array, weight: Array, keep: Array) -> Array:
-    """(m, 3, 3) of each step: what a small change would do as both sensors tell it, multiplied."""
-    product = np.swapaxes(se3.skew(w_base), 1, 2) @ keep @ se3.skew(w_sensor) * weight[:, None, None]
-    return 0.5 * (product + np.swapaxes(product, 1, 2))
+def _null_directions(w_base: Array, w_sensor: Array, keep: Array) -> Array:
+    """(k, 3) directions v along which ``keep @ (v x w)`` of the two sensors has nothing in common.
+
+    w_base, w_sensor: (m, 3) turns in base axes. keep: (m, 3, 3) what of a change shows, weighted.
+    """
+    by_base, by_sensor = keep @ se3.skew(w_base), keep @ se3.skew(w_sensor)
+    excitation = np.einsum("mia,mib->ab", by_base, by_sensor)
+    _, vectors = np.linalg.eigh(0.5 * (excitation + excitation.T))
+    return np.array([v for v in vectors.T if not _stand_out(by_base @ v, by_sensor @ v, 16.0)]).reshape(-1, 3)
+
+
+def _stand_out(a: Array, b: Array, kurtosis: float) -> bool:
+    """Whether two noisy readings (m, d) of one signal hold any: their product against its spread if they did not.
+
+    If both were noise, the variance of ``a . b`` would be at most ``E |a - b|^4 / kurtosis``: 12 in one
+    dimension, 16 in two, reached when both are equally noisy.
+    """
+    product = float(np.einsum("mi,mi->", a, b))
+    spread = np.sqrt((np.einsum("mi,mi->m", a - b, a - b) ** 2).sum() / kurtosis)
+    power = np.sqrt(float((a**2).sum()) * float((b**2).sum()))
+    return product > THRESHOLD * spread and product > COMMON * power
 
 
 def _weight(steps: Steps, i: int) -> Array:
     return 1 / np.trace(steps.cov[0, :, 3:, 3:] + steps.cov[i, :, 3:, 3:], axis1=1, axis2=2)
-
-
-def _null_directions(excitation: Array) -> Array:
-    """(k, 3) eigenvectors of the summed excitation that do not stand out of its spread."""
-    _, vectors = np.linalg.eigh(excitation.sum(axis=0))
-    along = np.einsum("ai,mab,bi->mi", vectors, excitation, vectors)
-    score = along.sum(axis=0) / np.sqrt((along**2).sum(axis=0)).clip(1e-300)
-    return vectors.T[score < DIRECTION_THRESHOLD]
 
 
 def _direction(name: str, axes: tuple[str, str, str], v: Array) -> dict[str, float]:
