@@ -67,7 +67,7 @@ class _Keys(dict[str, Any]):
 def _tables(file: Path) -> dict[str, dict[str, Any]]:
     try:
         content = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as e:
+    except (OSError, ValueError, RecursionError) as e:
         raise DataError(f"{file} can not be read: {e}; mend the file") from e
     unknown = [key for key in content if key != "sensors"]
     tables = content.get("sensors")

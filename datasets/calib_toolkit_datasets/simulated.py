@@ -19,6 +19,8 @@ from calib_toolkit import Calibration, DataError, Dataset, Log, MotionReading, R
 Array = NDArray[np.float64]
 GRID = 0.005
 """Seconds between the points of the vehicle's true path."""
+DRIVES = ("street", "rough", "planar", "straight", "turn", "static")
+LONGEST = 7200.0
 
 
 @hookimpl
@@ -61,12 +63,24 @@ class SimulatedSensor:
     stated: float = 1.0
     outliers: float = 0.0
 
+    def __post_init__(self) -> None:
+        if not np.all(np.isfinite(self.T_vehicle_sensor)) or not np.isfinite(self.dt):
+            raise ValueError(f"the pose and dt of {self.name} must be finite numbers")
+        if not 0.1 <= self.rate <= 1 / GRID:
+            raise ValueError(f"the rate of {self.name} must be from 0.1 to {1 / GRID:g} Hz")
+        if len(self.sigma) != 6 or not all(s > 0 for s in self.sigma):
+            raise ValueError(f"the sigma of {self.name} must be six positive numbers")
+
 
 def path(seconds: float, seed: int, drive: str = "street") -> Path6:
     """The vehicle's path. drive: street (like KITTI drive 27), rough, planar, straight, turn or static.
 
     Turns, stops and speeds are drawn at random; roll, pitch and heave are those of a car on its suspension.
     """
+    if drive not in DRIVES:
+        raise ValueError(f"there is no drive '{drive}'; there are: {', '.join(DRIVES)}")
+    if not 1.0 <= seconds <= LONGEST:
+        raise ValueError(f"a drive takes from 1 to {LONGEST:g} s")
     rng = np.random.default_rng(seed)
     stamps = np.arange(-2.0, seconds + 2.0, GRID)
     speed, yaw_rate = _speed(stamps, rng), _yaw_rate(stamps, rng)
@@ -133,11 +147,13 @@ def read(folder: Path, context: ReadContext) -> Log:
     try:
         table = tomllib.loads(file.read_text())
         sensors = [_sensor(name, values) for name, values in table["sensors"].items()]
-        true = path(float(table["seconds"]), int(table["seed"]), str(table.get("drive", "street")))
-    except (OSError, KeyError, TypeError, ValueError) as e:
+        if not sensors:
+            raise ValueError("it has no sensors")
+        seed = int(table["seed"])
+        true = path(float(table["seconds"]), seed, str(table.get("drive", "street")))
+        return Log(folder, {s.name: measure(true, s, seed) for s in sensors}, reference=truth(sensors))
+    except (OSError, KeyError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError) as e:
         raise DataError(f"{file} does not describe a simulated drive ({type(e).__name__}: {e})") from e
-    seed = int(table["seed"])
-    return Log(folder, {s.name: measure(true, s, seed) for s in sensors}, reference=truth(sensors))
 
 
 def _matches(folder: Path) -> bool:

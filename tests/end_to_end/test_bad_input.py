@@ -100,7 +100,8 @@ def rig(tmp_path):
             noise = np.random.default_rng([7, ord(name)]).normal(scale=0.003, size=(300, 3))
             columns = (stamps + EPOCH, T[:, :3, 3] + noise, Rotation.from_matrix(T[:, :3, :3]).as_quat())
             t, p, q = change(*columns) if name == "b" else columns
-            rows = (form % s + "".join(f" {x:.9f}" for x in (*a, *b)) for s, a, b in zip(t, p, q, strict=True))
+            stamp = form if name == "b" else "%.6f"
+            rows = (stamp % s + "".join(f" {x:.9f}" for x in (*a, *b)) for s, a, b in zip(t, p, q, strict=True))
             (folder / f"{name}.txt").write_text("\n".join(rows) + "\n")
         return folder
 

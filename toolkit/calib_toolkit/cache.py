@@ -1,10 +1,12 @@
 """Motions that were estimated before, kept on disk under a hash of everything they came from."""
 
 import os
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 from zlib import crc32
 
 import joblib
@@ -38,7 +40,7 @@ def load(folder: Path, key: str) -> tuple[Motions | Trajectory, tuple[str, ...]]
             if "has_scale" in values:
                 values["has_scale"] = bool(values["has_scale"])
             return kind(**values), tuple(str(n) for n in stored["notes"])
-    except (OSError, KeyError, ValueError, EOFError):
+    except (OSError, KeyError, ValueError, EOFError, BadZipFile, zlib.error):
         return None
 
 

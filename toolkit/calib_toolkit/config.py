@@ -7,12 +7,15 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from calib_toolkit.errors import ConfigError
 from calib_toolkit.rotation import RotationOptions
 from calib_toolkit.timing import TimingOptions
 from calib_toolkit.translation import TranslationOptions
 
 METHODS = ("paper",)
+TINY = 1e-3
 
 
 @dataclass(frozen=True)
@@ -46,21 +49,31 @@ class Config:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise ConfigError(f"there is no method '{self.method}'; there are: {', '.join(METHODS)}")
-        if self.duration is not None and self.duration <= 0:
-            raise ConfigError(f"a duration of {self.duration:g} s leaves nothing of the drive; give more than zero")
-        for name in ("timing", "rotation", "translation"):
-            trim = getattr(self, name).trim
-            if not 0 <= trim < 1:
-                raise ConfigError(f"{name}.trim = {trim:g} is not a share of the steps; give 0 to below 1")
         if self.timing.start not in ("correlation", "zero"):
             raise ConfigError(f"timing.start = '{self.timing.start}' is neither 'correlation' nor 'zero'")
+        for name, value, least, below in (
+            ("start", self.start, 0.0, np.inf),
+            ("duration", 1.0 if self.duration is None else self.duration, TINY, np.inf),
+            ("jobs", self.jobs, 1, np.inf),
+            ("sync.gate", self.sync.gate, TINY, np.inf),
+            ("timing.steps", self.timing.steps, 100, 1_000_001),
+            ("timing.max_offset", self.timing.max_offset, TINY, np.inf),
+            *(
+                (f"{stage}.trim", getattr(self, stage).trim, 0.0, 1.0)
+                for stage in ("timing", "rotation", "translation")
+            ),
+        ):
+            if not isinstance(value, int | float) or isinstance(value, bool) or not least <= value < below:
+                raise ConfigError(
+                    f"{name} = {value!r} is out of range; give a number from {least:g} to below {below:g}"
+                )
 
 
 def read_config(file: Path, **overrides: Any) -> Config:
     """The configuration in a TOML file; unknown names are refused. Raises ConfigError."""
     try:
         table = tomllib.loads(file.read_text())
-    except (OSError, ValueError) as e:
+    except (OSError, ValueError, RecursionError) as e:
         raise ConfigError(f"{file} can not be read as TOML: {e}") from e
     return replace(_filled(Config(), table, str(file)), **overrides)
 
@@ -92,6 +105,8 @@ def _table(value: Any, where: str, key: str) -> Mapping[str, Any]:
 def _same_type(current: Any, value: Any, where: str) -> Any:
     if isinstance(current, float) and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
-    if current is not None and type(value) is not type(current):
+    if current is None:
+        return value
+    if type(value) is not type(current):
         raise ConfigError(f"{where} is {value!r}, where a {type(current).__name__} is expected")
     return value

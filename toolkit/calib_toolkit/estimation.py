@@ -53,6 +53,8 @@ def estimate_motions(
     options: overrides by sensor name or kind. jobs: processes. folder: where finished slices are kept, or None.
     Raises CalibrationError.
     """
+    streams = list(streams)
+    _check_tables(streams, options)
     work = {stream.name: _slices(stream, sensor, options, folder) for stream, sensor in streams}
     for name, slices in work.items():
         progress.begin(name, sum(len(s.stream) - 1 for s in slices))
@@ -69,13 +71,23 @@ def estimate_motions(
     return {name: _joined(name, work[name], parts) for name, parts in done.items()}
 
 
+def _check_tables(streams: list[tuple[Stream, Sensor]], options: Mapping[str, Mapping[str, Any]]) -> None:
+    known = [*(stream.name for stream, _ in streams), *dict.fromkeys(sensor.id for _, sensor in streams)]
+    for table in options:
+        if table not in known:
+            raise ConfigError(
+                f"[sensors.{table}] of the configuration is neither a sensor of this run nor the kind of one; there "
+                f"are: {', '.join(known)}"
+            )
+
+
 def _slices(
     stream: Stream, sensor: Sensor, options: Mapping[str, Mapping[str, Any]], folder: Path | None
 ) -> list[_Slice]:
     if len(stream) < 2:
         raise DataError(
-            f"sensor {stream.name} has {len(stream)} reading{'s' * (len(stream) != 1)} in this part of the drive; "
-            "a motion takes two: leave it out with --sensors, or take a longer part"
+            f"sensor {stream.name} has {len(stream)} reading{'s' * (len(stream) != 1)} in the part of the drive that "
+            "was chosen, and a motion takes two; take another part (--start, --duration), or leave the sensor out"
         )
     chosen = _options(stream, sensor, options)
     chunk = sensor.chunk if isinstance(stream.readings, LazyReadings) else len(stream)

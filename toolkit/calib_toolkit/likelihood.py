@@ -59,7 +59,8 @@ def maximise(log_likelihood: Callable[[Array], float], start: Array, cov: Array)
     """
     if start.size == 0:
         return start
-    shape = np.linalg.cholesky(cov + 1e-12 * np.trace(cov) * np.eye(start.size))
+    variance, axes = np.linalg.eigh(cov)
+    shape = axes * np.sqrt(np.maximum(variance, 1e-12 * variance.max(initial=0.0)))
     best, value, size = np.zeros(start.size), -log_likelihood(start), 3.0
     for _ in range(5):
         found = minimize(

@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 
 THRESHOLD = 8.0
 """Standard deviations of noise: without any motion the best of several directions, or of many lags, reaches four."""
+VAGUE_TURN, VAGUE_SHIFT = np.radians(5.0), 1.0
+"""A sigma above these (radians, metres) tells nothing: a ruler does better."""
 COMMON = 0.3
 """Least correlation of the two sensors' readings: below it an estimate is biased by noise, however long the drive."""
 
@@ -92,6 +94,55 @@ def unmeasured_shifts(
             )
             for v in null
         ]
+    return found
+
+
+def vague_turns(names: Sequence[str], cov: Array, known: Sequence[Undetermined]) -> list[Undetermined]:
+    """Rotations that were measured, but to no use. cov: (3n, 3n). known: what is undetermined already."""
+    return _vague(
+        names,
+        cov,
+        known,
+        VAGUE_TURN,
+        ("rx", "ry", "rz"),
+        "the rotation of {} about {} was found only to "
+        "{:.0f} degrees; drive longer, with more bends, ramps or rough ground",
+        np.degrees(1.0),
+    )
+
+
+def vague_shifts(names: Sequence[str], cov: Array, known: Sequence[Undetermined]) -> list[Undetermined]:
+    """Positions that were measured, but to no use. cov: (3n, 3n). known: what is undetermined already."""
+    return _vague(
+        names,
+        cov,
+        known,
+        VAGUE_SHIFT,
+        ("x", "y", "z"),
+        "the position of {} along {} was found only to "
+        "{:.1f} m; drive longer, with more bends, ramps or rough ground",
+        1.0,
+    )
+
+
+def _vague(
+    names: Sequence[str],
+    cov: Array,
+    known: Sequence[Undetermined],
+    limit: float,
+    axes: tuple[str, str, str],
+    sentence: str,
+    unit: float,
+) -> list[Undetermined]:
+    found = []
+    for i, name in enumerate(names[1:], start=1):
+        if any(f"{name}.{axes[0]}" in u.direction for u in known):
+            continue  # its covariance holds what was said already
+        variance, vectors = np.linalg.eigh(cov[3 * i : 3 * i + 3, 3 * i : 3 * i + 3])
+        for v, sigma in zip(vectors.T, np.sqrt(np.maximum(variance, 0.0)), strict=True):
+            if sigma > limit:
+                words = sentence.format(name, _words(v, names[0]), sigma * unit)
+                found.append(Undetermined(_direction(name, axes, v), words))
     return found
 
 

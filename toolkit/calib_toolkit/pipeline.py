@@ -86,15 +86,18 @@ def calibrate_motions(
 
     steps = sync.synchronise(_on_base_clock(chains, offsets.dt), config.sync.gate)
     _check_steps(steps)
+    _check_lengths(names, steps)
     steps = sync.add_timing_noise(steps, offsets.cov)
 
     rotations = rotation.estimate(steps, config.rotation)
     unknown_turns = observability.unmeasured_turns(names, steps, rotations.R_base_sensor)
     _check_turning(names, unknown_turns)
+    unknown_turns += observability.vague_turns(names, rotations.cov, unknown_turns)
     progress.advance(STAGES, 1)
 
     translations = translation.estimate(steps, rotations, config.translation)
     unknown_shifts = observability.unmeasured_shifts(names, steps, rotations.R_base_sensor, unknown_turns)
+    unknown_shifts += observability.vague_shifts(names, translations.cov, unknown_shifts)
     progress.advance(STAGES, 1)
 
     timed = assembly.calibration(names, steps.has_scale, unknown_times, offsets)
@@ -108,6 +111,7 @@ def calibrate_motions(
             "readings": {n: len(m) for n, m in motions.items()},
             "common_steps": len(steps),
             "steps_rejected": steps.rejected,
+            "disagreement": rotation.disagreement(rotations.R_base_sensor, names, steps),
             "seconds": float(np.sum(np.diff(steps.ends, axis=1))),
         },
         warnings=tuple(warnings),
@@ -151,6 +155,19 @@ def _check_steps(steps: sync.Steps) -> None:
         f"the sensors share only {len(steps)} steps, too few to calibrate from ({steps.rejected} more were dropped "
         "because their turns disagreed by many sigma); take a longer part of the drive, or check the sensors' clocks"
     )
+
+
+def _check_lengths(names: Sequence[str], steps: sync.Steps) -> None:
+    """Refuse sensors that measure in different units: of all rigid points none goes twice as far as another."""
+    length = np.linalg.norm(steps.vec[..., :3], axis=-1).sum(axis=1)
+    noise = np.sqrt(np.trace(steps.cov[..., :3, :3], axis1=-2, axis2=-1)).sum(axis=1)
+    for i, name in enumerate(names[1:], start=1):
+        ratio = length[i] / max(length[0], 1e-9)
+        if steps.has_scale[i] and length[i] + length[0] > 4 * (noise[i] + noise[0]) and not 0.5 < ratio < 2.0:
+            raise DataError(
+                f"sensor {name} says it drove {length[i]:.4g} m where {names[0]} says {length[0]:.4g} m, so one of "
+                "them is not in metres; convert it, or state has_scale = false"
+            )
 
 
 def _check_turning(names: Sequence[str], unknown: Sequence[Undetermined]) -> None:

@@ -22,7 +22,7 @@ CONVENTION = (
 def write_result(result: Result, file: Path) -> None:
     """Write a result as JSON, whole or not at all."""
     part = file.with_suffix(".part")
-    part.write_text(json.dumps(result_dict(result), indent=1) + "\n")
+    part.write_text(json.dumps(result_dict(result), indent=1, allow_nan=False) + "\n")
     part.replace(file)
 
 

@@ -4,10 +4,12 @@ A rigid body's rotation vector is the same for all its sensors but for their axe
 written in base axes: ``w_i = R_base_i w_sensor``; turning a residual does not change its likelihood.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from calib_toolkit import delta, se3
 from calib_toolkit.likelihood import all_pairs, log_normal_3d, maximise, trimmed
@@ -81,6 +83,20 @@ def uncertainty(R: Array, steps: Steps, options: RotationOptions) -> Array:
     full = np.zeros((q + 3, q + 3))
     full[3:, 3:] = delta.larger(sums.cramer_rao(), sums.approximate_delta(cov))
     return full
+
+
+def disagreement(R: Array, names: Sequence[str], steps: Steps) -> dict[str, float]:
+    """How many times more two sensors' turns differ than their stated noise explains, by ``a-b``; ideally one.
+
+    The median of the squared normalised difference, against that of three degrees of freedom.
+    """
+    w, cov = _in_base_axes(R, steps)
+    found = {}
+    for x, y in all_pairs(len(w)):
+        error = w[x] - w[y]
+        squared = np.einsum("mi,mi->m", error, np.linalg.solve(cov[x] + cov[y], error[..., None])[..., 0])
+        found[f"{names[x]}-{names[y]}"] = float(np.sqrt(np.median(squared) / chi2.median(3)))
+    return found
 
 
 def _in_base_axes(R: Array, steps: Steps) -> tuple[Array, Array]:

@@ -123,6 +123,9 @@ def uncertainty(t: Array, terms: "Sequence[Term]", motion: Turned, options: Tran
     readings = np.block([[motion.cov_p, motion.cov_pw], [np.swapaxes(motion.cov_pw, -1, -2), motion.cov_w]])
     full = np.zeros((t.size, t.size))
     full[3:, 3:] = delta.larger(sums.cramer_rao(), sums.approximate_delta(readings))
+    # the sensors' turns are wrong by the same amount at every step, which no number of steps averages out
+    by_turns = sums.cramer_rao() @ _mixed_with_turns(t, terms, options)
+    full[3:, 3:] += by_turns @ motion.cov_turns @ by_turns.T
     return full
 
 
@@ -228,14 +231,24 @@ def _term(t: Array, motion: Turned, x: int, y: int, k: int) -> Term:
 
 def _from_turns(term: Term, motion: Turned, lever: Array) -> Array:
     """(m, 9) what the uncertain turns of x and y against the base add to the residual's covariance."""
+    J = _by_turns(term, lever)
+    rows = _rows(term)
+    return (J @ motion.cov_turns[np.ix_(rows, rows)] @ np.swapaxes(J, 1, 2)).reshape(-1, 9)
+
+
+def _by_turns(term: Term, lever: Array) -> Array:
+    """Derivative (m, 3, 6) of the residual by the turns of x and of y against the base."""
     length = term.length(term.D @ lever - term.p_x)
     by_x, by_y = se3.skew(term.p_x), -se3.skew(length * term.p_y)
     W = term.D + np.eye(3)
     swing = -se3.skew(W @ lever) + W @ se3.skew(lever)
     parts = [by_x + swing, by_y] if term.turned_by == term.x else [by_x, by_y + swing]
-    J = np.concatenate(parts, axis=2)
-    rows = np.r_[3 * term.x : 3 * term.x + 3, 3 * term.y : 3 * term.y + 3]
-    return (J @ motion.cov_turns[np.ix_(rows, rows)] @ np.swapaxes(J, 1, 2)).reshape(-1, 9)
+    return np.concatenate(parts, axis=2)
+
+
+def _rows(term: Term) -> NDArray[np.int64]:
+    """Where x's and y's three parameters stand among all."""
+    return np.r_[3 * term.x : 3 * term.x + 3, 3 * term.y : 3 * term.y + 3]
 
 
 def _times(stack: Array, vector: Array) -> Array:
@@ -243,15 +256,35 @@ def _times(stack: Array, vector: Array) -> Array:
     return (stack.reshape(-1, len(vector)) @ vector).reshape(stack.shape[:2])
 
 
+def _kept(t: Array, term: Term, options: TranslationOptions) -> tuple[NDArray[np.int64], Array, Array]:
+    """The steps of a term that are not trimmed, the residual's derivative (k, 3, 6) by t, its weight (k, 3, 3)."""
+    lever = t[term.x] - t[term.y]
+    error, cov = term.residual(lever)
+    at = np.flatnonzero(trimmed(log_normal_3d(error, cov), options.trim)[1])
+    by_lever = term.jacobians(lever)[0][at]
+    return (
+        at,
+        np.concatenate([by_lever, -by_lever], axis=2),
+        np.asarray(0.5 * np.linalg.inv(cov[at]), dtype=np.float64),
+    )
+
+
 def _sums(t: Array, terms: Sequence[Term], options: TranslationOptions) -> delta.Sums:
     sums = delta.Sums.zero(t.size - 3, len(t), len(terms[0].D), 6)
     for term in terms:
-        lever = t[term.x] - t[term.y]
-        error, cov = term.residual(lever)
-        at = np.flatnonzero(trimmed(log_normal_3d(error, cov), options.trim)[1])
-        by_lever, E_x, E_y = (e[at] for e in term.jacobians(lever))
+        at, by_t, weight = _kept(t, term, options)
+        _, E_x, E_y = term.jacobians(t[term.x] - t[term.y])
         J = np.zeros((len(at), 3, t.size))
-        J[:, :, 3 * term.x : 3 * term.x + 3] = by_lever
-        J[:, :, 3 * term.y : 3 * term.y + 3] = -by_lever
-        sums.add(at, term.x, term.y, J[:, :, 3:], 0.5 * np.linalg.inv(cov[at]), E_x, E_y)
+        J[:, :, _rows(term)] = by_t
+        sums.add(at, term.x, term.y, J[:, :, 3:], weight, E_x[at], E_y[at])
     return sums
+
+
+def _mixed_with_turns(t: Array, terms: Sequence[Term], options: TranslationOptions) -> Array:
+    """How the sensors' turns pull at the positions: (3n - 3, 3n)."""
+    mixed = np.zeros((t.size, t.size))
+    for term in terms:
+        at, by_t, weight = _kept(t, term, options)
+        by_turns = _by_turns(term, t[term.x] - t[term.y])[at]
+        mixed[np.ix_(_rows(term), _rows(term))] += np.einsum("mia,mij,mjb->ab", by_t, weight, by_turns, optimize=True)
+    return mixed[3:]

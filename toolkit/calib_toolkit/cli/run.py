@@ -1,8 +1,11 @@
 """``calib-toolkit run``: from a recorded drive to its calibration."""
 
 from pathlib import Path
+from tempfile import TemporaryFile
 
 import click
+
+from calib_toolkit.errors import DataError
 
 
 @click.command()
@@ -50,15 +53,28 @@ def run(
     config = replace(read_config(config_file) if config_file else Config(), **given)  # type: ignore[arg-type]
     installed = registry(plugins)
     log = installed.open_log(drive, format_id).select(_names(sensors))
+    file = _writable(out) if out else None
     with bars() as progress:
         result = calibrate(log, config, installed, progress)
     show_result(result, Console(highlight=False), log.reference)
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        write_result(result, out / "calibration.json")
-        click.echo(f"written: {out / 'calibration.json'}")
+    if file is not None:
+        write_result(result, file)
+        click.echo(f"written: {file}")
     if not result.complete:
         ctx.exit(3)
+
+
+def _writable(out: Path) -> Path:
+    """The result's file in a folder that exists and can be written, found out before the work and not after."""
+    file = out / "calibration.json"
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        if file.is_dir():
+            raise IsADirectoryError(f"{file} is a folder")
+        with TemporaryFile(dir=out):
+            return file
+    except OSError as e:
+        raise DataError(f"{out} can not take the result ({e.strerror or e}); choose another folder with -o") from e
 
 
 def _names(sensors: str | None) -> list[str] | None:

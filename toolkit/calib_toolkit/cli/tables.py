@@ -15,6 +15,8 @@ from calib_toolkit.types import Calibration, Result
 
 Array = NDArray[np.float64]
 COLUMNS = ("x\nm", "y\nm", "z\nm", "roll\ndeg", "pitch\ndeg", "yaw\ndeg", "dt\nms")
+NOISY = 1.5
+"""Disagreement of two sensors, in multiples of their stated noise, from which the reader is told."""
 DIGITS = (3, 3, 3, 2, 2, 2, 2)
 
 
@@ -36,6 +38,15 @@ def show_result(result: Result, console: Console, reference: Calibration | None 
     console.print(table)
     for u in c.undetermined:
         console.print(f"not determined: {u.sentence}", markup=False, soft_wrap=True)
+    noisy = {pair: times for pair, times in result.statistics.get("disagreement", {}).items() if times > NOISY}
+    if noisy:
+        pair, times = max(noisy.items(), key=lambda item: item[1])
+        console.print(
+            f"note: {len(noisy)} pair(s) of sensors turn differently by more than their stated noise explains, {pair} "
+            f"{times:.1f} times; their sigmas are too small by as much",
+            markup=False,
+            soft_wrap=True,
+        )
     for warning in result.warnings:
         console.print(f"warning: {warning}", markup=False, soft_wrap=True)
 

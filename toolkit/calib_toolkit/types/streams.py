@@ -118,9 +118,16 @@ class Log:
         return replace(self, streams={name: self.streams[name] for name in names})
 
     def trim(self, start: float = 0.0, duration: float | None = None) -> "Log":
-        """The part from ``start`` seconds after the first stamp of any sensor, ``duration`` seconds long."""
+        """The part from ``start`` seconds after the first stamp of any sensor, ``duration`` seconds long.
+
+        Raises DataError if nothing is left.
+        """
         if not self.streams or (start == 0.0 and duration is None):
             return self
-        t0 = min(s.stamps[0] for s in self.streams.values() if len(s)) + start
+        stamps = [s.stamps for s in self.streams.values() if len(s)]
+        t0 = min((s[0] for s in stamps), default=0.0) + start
+        last = max((s[-1] for s in stamps), default=0.0)
+        if t0 >= last:
+            raise DataError(f"{self.source} is {last - t0 + start:.1f} s long, so nothing is left after {start:g} s")
         t1 = np.inf if duration is None else t0 + duration
         return replace(self, streams={n: s.between(t0, t1) for n, s in self.streams.items()})
