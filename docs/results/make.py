@@ -96,7 +96,7 @@ def pair(recordings: Path, repeats: int = 50) -> None:
     """Fig. 7: INS against velodyne over drives of growing length, with the stated sigma."""
     print(
         "| rig | seconds | rotation deg | translation m | roll, pitch, yaw deg | x, y, z m | sigma of these |"
-        " within 1, 2 sigma of z-score % | undetermined or refused |"
+        " within 1, 2 sigma % | undetermined or refused |"
     )
     print("|---|---|---|---|---|---|---|---|---|")
     poses = truth(recordings)
@@ -112,29 +112,36 @@ def pair(recordings: Path, repeats: int = 50) -> None:
                 print(f"| {rig} | {seconds} | | | | | | | {repeats} of {repeats} |", flush=True)
                 continue
             total, error, sigma = (np.array(x) for x in zip(*rows, strict=True))
+            error, told = error[:, :6], error[:, 6]
             inside = np.abs(error / sigma)
             print(
                 f"| {rig} | {seconds} | {np.median(total[:, 0]):.2f} | {np.median(total[:, 1]):.2f} |"
                 f" {_numbers(np.median(np.abs(error[:, :3]), axis=0), 2)} |"
                 f" {_numbers(np.median(np.abs(error[:, 3:]), axis=0), 2)} | {_numbers(np.median(sigma, axis=0), 2)} |"
                 f" {100 * np.mean(inside < 1):.0f}, {100 * np.mean(inside < 2):.0f} |"
-                f" {repeats - len(rows)} of {repeats} |",
+                f" {repeats - int(told.sum())} of {repeats} |",
                 flush=True,
             )
 
 
 def _pair_errors(both: Drive, true: Array) -> tuple[Array, Array, Array] | None:
-    """((2,) total degrees and metres, (6,) roll pitch yaw x y z errors, (6,) their sigma), or None if not told."""
+    """(2,) total degrees and metres; (7,) errors, roll to z, and whether all were determined; (6,) sigma of the errors.
+
+    None if the drive was refused.
+    """
     try:
         c = calibrate_motions(both, Config()).calibration
     except CalibrationError:
         return None
-    if not c.determined.all():
-        return None
     delta = np.degrees(se3.log_so3(true[:3, :3] @ c.T_base_sensor[1, :3, :3].T))
     shift = c.T_base_sensor[1, :3, 3] - true[:3, 3]
     total = np.array([np.linalg.norm(delta), np.linalg.norm(shift)])
-    return total, np.concatenate([delta, shift]), np.concatenate([np.degrees(c.sigma[1, 3:6]), c.sigma[1, :3]])
+    sigma = np.sqrt(np.diag(c.covariance)[7:14])
+    return (
+        total,
+        np.concatenate([delta, shift, [c.determined.all()]]),
+        np.concatenate([np.degrees(sigma[3:6]), sigma[:3]]),
+    )
 
 
 def panoramic(recordings: Path, repeats: int = 100) -> None:

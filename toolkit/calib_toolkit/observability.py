@@ -19,8 +19,8 @@ Array = NDArray[np.float64]
 
 THRESHOLD = 8.0
 """Standard deviations of noise: without any motion the best of several directions, or of many lags, reaches four."""
-VAGUE_TURN, VAGUE_SHIFT = np.radians(5.0), 1.0
-"""A sigma above these (radians, metres) tells nothing: a ruler does better."""
+VAGUE_TURN_DEG, VAGUE_SHIFT = 5.0, 1.0
+"""A sigma above these (degrees, metres) tells nothing: a ruler does better."""
 COMMON = 0.3
 """Least correlation of the two sensors' readings: below it an estimate is biased by noise, however long the drive."""
 
@@ -99,51 +99,38 @@ def unmeasured_shifts(
 
 def vague_turns(names: Sequence[str], cov: Array, known: Sequence[Undetermined]) -> list[Undetermined]:
     """Rotations that were measured, but to no use. cov: (3n, 3n). known: what is undetermined already."""
-    return _vague(
-        names,
-        cov,
-        known,
-        VAGUE_TURN,
-        ("rx", "ry", "rz"),
-        "the rotation of {} about {} was found only to "
-        "{:.0f} degrees; drive longer, with more bends, ramps or rough ground",
-        np.degrees(1.0),
-    )
+    what = "the rotation of {} about {} of {} was found only to {:.0f} degrees"
+    return _vague(names, np.degrees(_sigma(cov)), known, VAGUE_TURN_DEG, ("rx", "ry", "rz"), what)
 
 
 def vague_shifts(names: Sequence[str], cov: Array, known: Sequence[Undetermined]) -> list[Undetermined]:
     """Positions that were measured, but to no use. cov: (3n, 3n). known: what is undetermined already."""
-    return _vague(
-        names,
-        cov,
-        known,
-        VAGUE_SHIFT,
-        ("x", "y", "z"),
-        "the position of {} along {} was found only to "
-        "{:.1f} m; drive longer, with more bends, ramps or rough ground",
-        1.0,
-    )
+    what = "the position of {} along {} of {} was found only to {:.1f} m"
+    return _vague(names, _sigma(cov), known, VAGUE_SHIFT, ("x", "y", "z"), what)
+
+
+def _sigma(cov: Array) -> Array:
+    return np.sqrt(np.maximum(np.diag(cov), 0.0)).reshape(-1, 3)
 
 
 def _vague(
     names: Sequence[str],
-    cov: Array,
+    sigma: Array,
     known: Sequence[Undetermined],
     limit: float,
     axes: tuple[str, str, str],
-    sentence: str,
-    unit: float,
+    what: str,
 ) -> list[Undetermined]:
-    found = []
-    for i, name in enumerate(names[1:], start=1):
-        if any(f"{name}.{axes[0]}" in u.direction for u in known):
-            continue  # its covariance holds what was said already
-        variance, vectors = np.linalg.eigh(cov[3 * i : 3 * i + 3, 3 * i : 3 * i + 3])
-        for v, sigma in zip(vectors.T, np.sqrt(np.maximum(variance, 0.0)), strict=True):
-            if sigma > limit:
-                words = sentence.format(name, _words(v, names[0]), sigma * unit)
-                found.append(Undetermined(_direction(name, axes, v), words))
-    return found
+    return [
+        Undetermined(
+            {f"{name}.{axis}": 1.0},
+            what.format(name, axis[-1], names[0], sigma[i, k]) + "; drive longer, with more bends and rough ground",
+        )
+        for i, name in enumerate(names)
+        if not any(f"{name}.{axes[0]}" in u.direction for u in known)  # then it was said already, and why
+        for k, axis in enumerate(axes)
+        if sigma[i, k] > limit
+    ]
 
 
 def _null_directions(w_base: Array, w_sensor: Array, keep: Array) -> Array:

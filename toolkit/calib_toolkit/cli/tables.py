@@ -42,8 +42,8 @@ def show_result(result: Result, console: Console, reference: Calibration | None 
     if noisy:
         pair, times = max(noisy.items(), key=lambda item: item[1])
         console.print(
-            f"note: {len(noisy)} pair(s) of sensors turn differently by more than their stated noise explains, {pair} "
-            f"{times:.1f} times; their sigmas are too small by as much",
+            f"note: {len(noisy)} pair(s) of sensors turn differently by more than their stated noise explains, "
+            f"{pair} {times:.1f} times as much; their sigmas are too small by about that",
             markup=False,
             soft_wrap=True,
         )
