@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_toolkit import CameraIntrinsics, Dataset, LazyReadings, Log, ReadContext, Stream, hookimpl, se3
+from calib_toolkit import CameraIntrinsics, Dataset, LazyReadings, Log, ReadContext, Stream, hookimpl, se3, tables
 from calib_toolkit.errors import DataError
 from calib_toolkit.types import Calibration
 from calib_toolkit_datasets import kitti_files, stamps
@@ -66,7 +66,7 @@ def open_log(path: Path, context: ReadContext) -> Log:
         raise DataError(f"{path} holds no scans and no images: {'; '.join(notes) or 'its folders are missing'}")
     stamp_files = {n: layout.homes[n] / "timestamps.txt" for n in files}
     if all(f.is_file() for f in stamp_files.values()):
-        matched = {n: stamps.match(n, f, stamps.read_stamps(stamp_files[n])) for n, f in files.items()}
+        matched = {n: stamps.match(n, f, tables.read_stamps(stamp_files[n])) for n, f in files.items()}
     else:
         matched = {n: stamps.made_up(n, f, PERIOD_NS) for n, f in files.items()}
     notes += tuple(
@@ -102,7 +102,7 @@ def _layout(path: Path) -> _Layout:
 
 
 def _stream(layout: _Layout, name: str, matched: stamps.Matched, epoch_ns: int) -> Stream:
-    times = stamps.seconds(matched.ns, epoch_ns)
+    times = tables.seconds(matched.ns, epoch_ns)
     if name == "velo":
         # the stamp is when the laser faces forward, which is mid-sweep
         period = float(np.median(np.diff(times))) if len(times) > 1 else float("nan")

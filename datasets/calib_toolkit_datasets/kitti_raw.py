@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_toolkit import CameraIntrinsics, Dataset, Fix, LazyReadings, Log, ReadContext, Stream, hookimpl, se3
+from calib_toolkit import CameraIntrinsics, Dataset, LazyReadings, Log, ReadContext, Stream, hookimpl, se3, tables
 from calib_toolkit.errors import DataError
-from calib_toolkit.types import Calibration
+from calib_toolkit.types import Calibration, Fix
 from calib_toolkit_datasets import kitti_files, stamps
 
 Array = NDArray[np.float64]
@@ -44,10 +44,10 @@ def open_log(path: Path, context: ReadContext) -> Log:
     """Every sensor of a drive that has readings with stamps. Raises DataError if there is none."""
     path = path.absolute()
     present = [name for name, folder in FOLDERS.items() if (path / folder).is_dir()]
-    tables = {name: _sweeps(path / FOLDERS[name]) for name in present}
+    sweeps = {name: _sweeps(path / FOLDERS[name]) for name in present}
     matched = {
         name: stamps.match(
-            name, kitti_files.numbered_files(path / FOLDERS[name] / "data", SUFFIXES[name]), tables[name][0]
+            name, kitti_files.numbered_files(path / FOLDERS[name] / "data", SUFFIXES[name]), sweeps[name][0]
         )
         for name in present
     }
@@ -56,7 +56,7 @@ def open_log(path: Path, context: ReadContext) -> Log:
     if not kept:
         raise DataError(f"{path} holds no reading of any sensor: {'; '.join(notes) or 'its folders are missing'}")
     epoch_ns = min(int(m.ns[0]) for m in kept.values())
-    streams = {name: _stream(path, name, m, tables[name][1], epoch_ns) for name, m in kept.items()}
+    streams = {name: _stream(path, name, m, sweeps[name][1], epoch_ns) for name, m in kept.items()}
     return Log(path, streams, epoch_ns, _reference(path, streams), notes)
 
 
@@ -85,19 +85,19 @@ def load_fix(path: Path, sensor: str) -> Fix:
     return Fix(float(lat), float(lon), packet.alt, packet.roll, packet.pitch, packet.yaw, sigma)
 
 
-def _sweeps(folder: Path) -> tuple[stamps.Nanoseconds, Array]:
+def _sweeps(folder: Path) -> tuple[tables.Nanoseconds, Array]:
     """Stamps of every line, and the seconds that its sweep took (nan where not known).
 
     A scan's stamp is the middle of its sweep. timestamps.txt tells when the laser faces forward, which is
     the same instant, and stands in where start or end are missing.
     """
     files = [folder / f"timestamps{part}.txt" for part in ("", "_start", "_end")]
-    columns = [stamps.read_stamps(f) if f.is_file() else np.zeros(0, dtype=np.int64) for f in files]
-    table = np.full((3, max(map(len, columns))), stamps.BLANK)
+    columns = [tables.read_stamps(f) if f.is_file() else np.zeros(0, dtype=np.int64) for f in files]
+    table = np.full((3, max(map(len, columns))), tables.BLANK)
     for row, column in zip(table, columns, strict=True):
         row[: len(column)] = column
     front, start, end = table
-    both = (start != stamps.BLANK) & (end != stamps.BLANK)
+    both = (start != tables.BLANK) & (end != tables.BLANK)
     took = np.where(both, end - np.where(both, start, end), 0)
     both &= (took > 0) & (took < LONGEST_SWEEP * 1e9)
     period = np.where(both, took / 1e9, np.nan)
@@ -130,7 +130,7 @@ def _stream(path: Path, name: str, matched: stamps.Matched, period: Array, epoch
             notes = (*notes, f"{name} has no intrinsics: {e}")
         size = intrinsics.size if intrinsics else None
         readings = LazyReadings(partial(kitti_files.load_image, sensor=name, size=size), keys)
-    times = stamps.seconds(matched.ns, epoch_ns)
+    times = tables.seconds(matched.ns, epoch_ns)
     return Stream(name, KINDS[name], times, readings, intrinsics, has_scale=name not in CAMERAS, notes=notes)
 
 

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_toolkit import CameraIntrinsics, Dataset, Log, MotionReading, ReadContext, Stream, hookimpl, se3
+from calib_toolkit import CameraIntrinsics, Dataset, Log, MotionReading, ReadContext, Stream, hookimpl, se3, tables
 from calib_toolkit.errors import DataError
-from calib_toolkit_datasets import stamps
 
 Array = NDArray[np.float64]
 
@@ -40,11 +39,11 @@ def matches(path: Path) -> bool:
 def open_log(path: Path, context: ReadContext) -> Log:
     """Sensors ``velo``, ``ins`` and, in the order of their numbers, ``cam0``, ``cam1``, ... Raises DataError."""
     files = _files(path)
-    tables = {name: _table(name, file) for name, file in files.items()}
-    epoch_ns = min(int(ns[0]) for ns, _, _, _ in tables.values())
+    contents = {name: _table(name, file) for name, file in files.items()}
+    epoch_ns = min(int(ns[0]) for ns, _, _, _ in contents.values())
     streams = {}
-    for name, (ns, readings, intrinsics, notes) in tables.items():
-        times, scaled = stamps.seconds(ns, epoch_ns), not name.startswith("cam")
+    for name, (ns, readings, intrinsics, notes) in contents.items():
+        times, scaled = tables.seconds(ns, epoch_ns), not name.startswith("cam")
         streams[name] = Stream(name, "odometry", times, readings, intrinsics, has_scale=scaled, notes=notes)
     return Log(path, streams, epoch_ns)
 
@@ -79,7 +78,7 @@ def _files(path: Path) -> dict[str, Path]:
 
 def _table(
     name: str, file: Path
-) -> tuple[stamps.Nanoseconds, list[MotionReading], CameraIntrinsics | None, tuple[str, ...]]:
+) -> tuple[tables.Nanoseconds, list[MotionReading], CameraIntrinsics | None, tuple[str, ...]]:
     """Stamps, readings, intrinsics and notes of one file, readings with unusable stamps dropped."""
     data = _loaded(name, file)
     vec, variance = (_rows(data, field, name, file) for field in ("T_Skm1_Sk", "T_Var_Skm1_Sk"))
@@ -91,7 +90,7 @@ def _table(
             "all must be as many"
         )
     usable = np.all(np.isfinite(vec) & np.isfinite(variance) & (variance > 0) & (variance < FAILED_VARIANCE), axis=1)
-    keep = stamps.increasing(ns)
+    keep = tables.increasing(ns)
     usable[1:] &= keep[:-1]  # what follows a dropped reading is not the motion since the reading kept before it
     usable[0] = False
     silent = ~usable & keep

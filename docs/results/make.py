@@ -125,7 +125,7 @@ def pair(recordings: Path, repeats: int = 50) -> None:
 
 
 def _pair_errors(both: Drive, true: Array) -> tuple[Array, Array, Array] | None:
-    """(2,) total degrees and metres; (7,) errors, roll to z, and whether all were determined; (6,) sigma of the errors.
+    """(2,) total degrees and metres; (7,) errors and whether all were determined; (6,) their sigma.
 
     None if the drive was refused.
     """

@@ -1,11 +1,10 @@
 """Wheel odometry: the motion of a vehicle's rear axle from its speed and yaw rate."""
 
 from dataclasses import dataclass
-from decimal import Decimal
 
 import numpy as np
 
-from calib_toolkit import DataError, Log, Motions, Sensor, SensorTable, Stream, hookimpl
+from calib_toolkit import DataError, Log, Motions, Sensor, SensorTable, Stream, hookimpl, tables
 
 
 @dataclass(frozen=True)
@@ -38,16 +37,14 @@ def estimate(stream: Stream, options: WheelOptions) -> Motions:
 
 def open_table(table: SensorTable) -> Log:
     """``rates = FILE.csv``: a line of titles, then ``stamp,speed,yaw_rate``: s, m/s, rad/s. Raises DataError."""
-    file = table.folder / str(table.values["rates"])
-    try:
-        rows = [line.split(",") for line in file.read_text().splitlines()[1:]]
-        stamps_ns = [round(Decimal(row[0]) * 10**9) for row in rows]
-        rates = [(float(speed), float(yaw_rate)) for _, speed, yaw_rate in rows]
-    except (OSError, ValueError, ArithmeticError) as e:
-        raise DataError(f"sensor {table.name}: rates = {file} is not a file of stamp,speed,yaw_rate ({e})") from e
-    epoch_ns = stamps_ns[0] if rows else 0
-    stamps = np.array([s - epoch_ns for s in stamps_ns]) * 1e-9
-    return Log(file, {table.name: Stream(table.name, "wheel_odometry", stamps, rates)}, epoch_ns)
+    tables.refuse_unknown(table, ["rates"])
+    file = tables.table_file(table, "rates")
+    _, *rows = tables.read_rows(file, 3, 3, titles=True)
+    ns, numbers = tables.to_nanoseconds(rows), tables.to_numbers(rows, 3)
+    keep, notes = tables.usable_rows(ns, numbers, rows)
+    stamps, epoch_ns = tables.seconds(ns[keep], ns[keep[0]]), int(ns[keep[0]])
+    stream = Stream(table.name, "wheel_odometry", stamps, list(numbers[keep, 1:]), notes=notes)
+    return Log(file, {table.name: stream}, epoch_ns)
 
 
 @hookimpl

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib_toolkit import DataError, Sensor, SensorTable, hookimpl, se3
+from calib_toolkit import DataError, Sensor, SensorTable, hookimpl, se3, tables
 from calib_toolkit.types import Fix, Log, Stream, Trajectory
-from calib_toolkit_plugins.odometry import read_rows, table_file, to_nanoseconds, to_numbers, usable_rows
 
 Array = NDArray[np.float64]
 
@@ -86,23 +85,19 @@ def open_table(table: SensorTable) -> Log:
     ``fixes = FILE.csv``, whose first line names its columns: ``stamp,lat_deg,lon_deg,alt,roll_deg,pitch_deg,yaw_deg``
     and at will ``sigma_east,sigma_north,sigma_up`` (metres) and ``sigma_roll_deg,sigma_pitch_deg,sigma_yaw_deg``.
     """
-    for key in sorted(set(table.values) - {"kind", "fixes"}):
-        raise DataError(f"sensor {table.name}: a gps_ins table has no key '{key}'; it may have fixes")
-    header, *rows = read_rows(table_file(table, "fixes"), len(COLUMNS), len(COLUMNS + SIGMA_COLUMNS))
+    tables.refuse_unknown(table, ["fixes"])
+    file = tables.table_file(table, "fixes")
+    header = tables.read_rows(file, len(COLUMNS), len(COLUMNS + SIGMA_COLUMNS))[0]
     names = tuple(w.lower() for w in header.words)
     if names[:7] != COLUMNS or names[7:] not in (SIGMA_COLUMNS, SIGMA_COLUMNS[:3], SIGMA_COLUMNS[3:], ()):
         raise DataError(
-            f"{header.file}: its first line must be {','.join(COLUMNS)} and then, at will, "
+            f"{file}: its first line must be {','.join(COLUMNS)} and then, at will, "
             f"{','.join(SIGMA_COLUMNS[:3])} and {','.join(SIGMA_COLUMNS[3:])}; it is {','.join(header.words)}"
         )
-    rows = read_rows(header.file, len(names), len(names))[1:]
-    if not rows:
-        raise DataError(f"{header.file} holds no fixes below its first line; name a file that does")
-    stamps_ns = [to_nanoseconds(r) for r in rows]
-    numbers = np.array([to_numbers(r) for r in rows])
-    keep, notes = usable_rows(stamps_ns, numbers, rows)
-    epoch_ns = stamps_ns[keep[0]] or 0
-    stamps = np.array([(stamps_ns[i] or 0) - epoch_ns for i in keep]) * 1e-9
+    rows = tables.read_rows(file, len(names), len(names), titles=True)[1:]
+    ns, numbers = tables.to_nanoseconds(rows), tables.to_numbers(rows, len(names))
+    keep, notes = tables.usable_rows(ns, numbers, rows)
+    epoch_ns = int(ns[keep[0]])
     columns = {c: np.deg2rad(x) if c.endswith("_deg") else x for c, x in zip(names, numbers[keep].T, strict=True)}
     values = np.stack([columns[c] for c in COLUMNS[1:]], axis=1)
     position, rpy = (
@@ -112,7 +107,8 @@ def open_table(table: SensorTable) -> Log:
     fixes = [
         Fix(v[0], v[1], v[2], v[3], v[4], v[5], p, a) for v, p, a in zip(values.tolist(), position, rpy, strict=True)
     ]
-    return Log(header.file, {table.name: Stream(table.name, "gps_ins", stamps, fixes, notes=notes)}, epoch_ns)
+    stream = Stream(table.name, "gps_ins", tables.seconds(ns[keep], epoch_ns), fixes, notes=notes)
+    return Log(file, {table.name: stream}, epoch_ns)
 
 
 def _attitude(rpy: Array) -> Array:

@@ -1,23 +1,19 @@
 """Cameras in a rig.toml: folders of images, their stamps, and what is known of each lens."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from decimal import Decimal, InvalidOperation
-from os.path import expanduser
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_toolkit import CameraIntrinsics, LazyReadings, Log, SensorTable, Stream
+from calib_toolkit import CameraIntrinsics, LazyReadings, Log, SensorTable, Stream, tables
 from calib_toolkit.errors import DataError
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
-LENS_KEYS = {"images", "camera_matrix", "distortion", "mask"}
-STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?")
-
-Nanoseconds = int
+LENS_KEYS = ("images", "camera_matrix", "distortion", "mask")
 
 
 def load_image(file: Path) -> NDArray[np.uint8]:
@@ -41,45 +37,24 @@ def open_cameras(table: SensorTable, kind: str, heads: Mapping[str, Mapping[str,
     (OpenCV's order) and ``mask`` (an image, non-zero where it may be used). An image belongs to a stamp by the last
     number in its name, so that one missing in one head shifts nothing. Raises DataError.
     """
-    files = {name: _images(name, _path(f"sensor {name}", table, values, "images")) for name, values in heads.items()}
-    times = _path(f"sensor {table.name}", table, table.values, "times")
-    ns_of = _stamps_by_number(f"sensor {table.name}", times, sorted({n for images in files.values() for n in images}))
+    lenses = {name: replace(table, name=name, values=values) for name, values in heads.items()}
+    files = {name: _images(name, tables.table_folder(lens, "images")) for name, lens in lenses.items()}
+    ns_of = _stamps_by_number(table, sorted({n for images in files.values() for n in images}))
     epoch_ns = min(ns_of.values())
     streams = {}
-    for name, values in heads.items():
+    for name, lens in lenses.items():
         numbers = sorted(files[name])
-        stamps = np.array([ns_of[n] - epoch_ns for n in numbers]) / 1e9
+        stamps = tables.seconds(np.array([ns_of[n] for n in numbers]), epoch_ns)
         readings = LazyReadings(load_image, [files[name][n] for n in numbers])
-        lens = _intrinsics(name, table, values, readings[0])
+        intrinsics = _intrinsics(lens, readings[0])
         gone = len(ns_of) - len(numbers)
         notes = (f"{name}: {gone} of {len(ns_of)} images are missing",) if gone else ()
-        streams[name] = Stream(name, kind, stamps, readings, lens, has_scale=False, clock=table.name, notes=notes)
+        streams[name] = Stream(name, kind, stamps, readings, intrinsics, False, clock=table.name, notes=notes)
     return Log(table.folder, streams, epoch_ns)
-
-
-def refuse_unknown(where: str, values: Mapping[str, Any], known: Iterable[str]) -> None:
-    """Raises DataError for a key that this table does not have (a misspelt one would be ignored in silence)."""
-    for key in values:
-        if key not in known:
-            raise DataError(
-                f"{where} has the key '{key}', which is unknown here; known are {', '.join(sorted(known))}"
-            )
-
-
-def _path(where: str, table: SensorTable, values: Mapping[str, Any], key: str) -> Path:
-    value = values.get(key)
-    if not isinstance(value, str):
-        raise DataError(f"{where} needs '{key}' with a path; {'add it' if value is None else f'it is {value!r}'}")
-    path = table.folder / expanduser(value)
-    if not path.exists():
-        raise DataError(f"{where}: there is no {path}; correct '{key}'")
-    return path
 
 
 def _images(name: str, folder: Path) -> dict[int, Path]:
     """The images of a folder by the last number in their name."""
-    if not folder.is_dir():
-        raise DataError(f"sensor {name}: 'images' is {folder}, which is not a folder; name the folder of the images")
     found: dict[int, Path] = {}
     for file in sorted(f for f in folder.iterdir() if f.suffix.lower() in SUFFIXES):
         digits = re.findall(r"\d+", file.stem)
@@ -95,15 +70,16 @@ def _images(name: str, folder: Path) -> dict[int, Path]:
     return found
 
 
-def _stamps_by_number(where: str, file: Path, numbers: Sequence[int]) -> dict[int, Nanoseconds]:
-    """The stamp of every numbered image, from lines that hold a stamp, or an image's number and its stamp."""
-    try:
-        lines = [line.strip() for line in file.read_text(encoding="utf-8").splitlines()]
-    except (OSError, UnicodeDecodeError) as e:
-        raise DataError(f"{where}: {file} can not be read ({type(e).__name__}); give a text file of stamps") from e
-    rows = [_row(file, k, line) for k, line in enumerate(lines, 1) if line and not line.startswith("#")]
-    if not rows:
-        raise DataError(f"{where}: {file} holds no stamps; write one for each image")
+def _stamps_by_number(table: SensorTable, numbers: Sequence[int]) -> dict[int, int]:
+    """Nanoseconds of every numbered image, from lines that hold a stamp, or an image's number and its stamp."""
+    where, file = f"sensor {table.name}", tables.table_file(table, "times")
+    given, stamps = zip(*map(_number_and_stamp, tables.read_rows(file, 1, 3)), strict=True)
+    ns = tables.to_nanoseconds(stamps).tolist()
+    if tables.BLANK in ns:
+        raise DataError(
+            f"{stamps[ns.index(tables.BLANK)].place} holds no stamp; write one, or remove it and its images"
+        )
+    rows = list(zip(given, ns, strict=True))
     if any(number is not None for number, _ in rows):
         by_number = {number: ns for number, ns in rows if number is not None}
     elif len(rows) == len(numbers):
@@ -123,25 +99,19 @@ def _stamps_by_number(where: str, file: Path, numbers: Sequence[int]) -> dict[in
     return {n: by_number[n] for n in numbers}
 
 
-def _row(file: Path, k: int, line: str) -> tuple[int | None, Nanoseconds]:
-    """(image number or None, stamp in nanoseconds) of ``[number] stamp``, seconds or ``2011-09-26 13:02:25.964``."""
-    *number, stamp = [line] if STAMP.fullmatch(line) else line.split(maxsplit=1)
-    try:
-        if STAMP.fullmatch(stamp):
-            ns = int(np.datetime64(stamp.replace(" ", "T"), "ns").astype(np.int64))
-        else:
-            ns = int(Decimal(stamp) * 10**9)
-        return (int(number[0]) if number else None), ns
-    except (ValueError, OverflowError, InvalidOperation) as e:
-        raise DataError(
-            f"{file}: line {k} ('{line}') is not a stamp in seconds, or an image's number and its stamp; mend it"
-        ) from e
+def _number_and_stamp(row: tables.Row) -> tuple[int | None, tables.Row]:
+    """(image number or None, the row without it) of ``[number] stamp``; the stamp may be a date of two words."""
+    text = " ".join(row.words)
+    plain = len(row.words) == 1 or tables.DATE.fullmatch(text)
+    number, _, stamp = ("", "", text) if plain else text.partition(" ")
+    if not (plain or number.isdecimal()):
+        raise DataError(f"{row.place}: '{text}' is neither a stamp nor an image's number and its stamp; mend it")
+    return int(number) if number else None, row._replace(words=[stamp])
 
 
-def _intrinsics(
-    name: str, table: SensorTable, values: Mapping[str, Any], image: NDArray[np.uint8]
-) -> CameraIntrinsics:
-    refuse_unknown(f"sensor {name}", values, LENS_KEYS)
+def _intrinsics(lens: SensorTable, image: NDArray[np.uint8]) -> CameraIntrinsics:
+    tables.refuse_unknown(lens, LENS_KEYS)
+    name, values = lens.name, lens.values
     if "camera_matrix" not in values:
         raise DataError(f"sensor {name} has no camera_matrix; add its nine numbers (fx 0 cx 0 fy cy 0 0 1, pixels)")
     K = _numbers(name, "camera_matrix", values["camera_matrix"])
@@ -156,7 +126,7 @@ def _intrinsics(
     h, w = image.shape[:2]
     mask = None
     if "mask" in values:
-        drawn = load_image(_path(f"sensor {name}", table, values, "mask"))
+        drawn = load_image(tables.table_file(lens, "mask"))
         mask = np.asarray(drawn if drawn.ndim == 2 else drawn.max(axis=2), dtype=np.uint8)
         if mask.shape != (h, w):
             raise DataError(

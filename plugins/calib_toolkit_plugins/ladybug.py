@@ -1,8 +1,8 @@
 """A panoramic camera of several heads that are triggered together: one clock, each head a sensor of its own."""
 
-from calib_toolkit import Log, Sensor, SensorTable, hookimpl
+from calib_toolkit import Log, Sensor, SensorTable, hookimpl, tables
 from calib_toolkit.errors import DataError
-from calib_toolkit_plugins.image_tables import open_cameras, refuse_unknown
+from calib_toolkit_plugins.image_tables import open_cameras
 from calib_toolkit_plugins.monocular import MonocularOptions, estimate
 
 
@@ -18,11 +18,10 @@ def open_table(table: SensorTable) -> Log:
     Keys: ``times`` (see :func:`~calib_toolkit_plugins.image_tables.open_cameras`) and ``heads``, a list of tables
     with ``images``, ``camera_matrix``, and at will ``distortion`` and ``mask``. Raises DataError.
     """
-    where = f"sensor {table.name}"
-    refuse_unknown(where, table.values, {"times", "heads"})
+    tables.refuse_unknown(table, ["times", "heads"])
     heads = table.values.get("heads")
     if not isinstance(heads, list) or not heads or not all(isinstance(head, dict) for head in heads):
         raise DataError(
-            f"{where} needs 'heads', a list with a table {{images = ..., camera_matrix = ...}} for each head"
+            f"sensor {table.name} needs 'heads', a list with a table {{images = ..., camera_matrix = ...}} a head"
         )
     return open_cameras(table, "ladybug", {f"{table.name}{k}": head for k, head in enumerate(heads)})

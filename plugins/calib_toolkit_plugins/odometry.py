@@ -2,23 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from decimal import Decimal, InvalidOperation
 from itertools import pairwise
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib_toolkit import DataError, Sensor, SensorTable, hookimpl, se3
+from calib_toolkit import DataError, Sensor, SensorTable, hookimpl, se3, tables
 from calib_toolkit.types import Log, MotionReading, Motions, PoseReading, Stream, Trajectory
 
 Array = NDArray[np.float64]
 
 COLUMNS = {"tum": (8, 8), "euroc": (8, 17), "kitti": (12, 12)}
 """Fewest and most columns of each format's rows."""
-KEYS = ("kind", "poses", "format", "times", "has_scale", "motion_sigma", "sigmas")
+KEYS = ("poses", "format", "times", "has_scale", "motion_sigma", "sigmas")
 
 NOISE_FLOOR = np.array([1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5])
 """No estimated noise of a step is believed to be below this (metres, radians)."""
@@ -110,24 +108,24 @@ def open_table(table: SensorTable) -> Log:
     (a file of such six numbers a row: the step that ends at the pose of that row).
     """
     name, values = table.name, table.values
-    for key in [k for k in values if k not in KEYS]:
-        raise DataError(f"sensor {name}: an odometry table has no key '{key}'; it may have {', '.join(KEYS[1:])}")
+    tables.refuse_unknown(table, KEYS)
     style, has_scale = values.get("format"), values.get("has_scale", True)
     if style not in COLUMNS:
         raise DataError(f"sensor {name}: format = {style!r} is unknown; write one of {', '.join(COLUMNS)}")
     if not isinstance(has_scale, bool):
         raise DataError(f"sensor {name}: has_scale must be true or false, not {has_scale!r}")
-    rows = read_rows(table_file(table, "poses"), *COLUMNS[style])
+    rows = tables.read_rows(tables.table_file(table, "poses"), *COLUMNS[style])
     timed = _rows_beside(table, "times", rows, 1) if style == "kitti" else rows
-    stamps_ns = [to_nanoseconds(r, "1e-9" if style == "euroc" else "1") for r in timed]
-    numbers = np.array([to_numbers(r)[: COLUMNS[style][0]] for r in rows])
-    keep, notes = usable_rows(stamps_ns, numbers, rows)
+    ns = tables.to_nanoseconds(timed, "1e-9" if style == "euroc" else "1")
+    numbers = tables.to_numbers(rows, COLUMNS[style][0])
+    keep, notes = tables.usable_rows(ns, numbers, rows)
     T = _poses(style, numbers[keep], [rows[i] for i in keep])
-    epoch_ns = stamps_ns[keep[0]] or 0
-    stamps = np.array([(stamps_ns[i] or 0) - epoch_ns for i in keep]) * 1e-9
+    epoch_ns = int(ns[keep[0]])
+    stamps = tables.seconds(ns[keep], epoch_ns)
     steps = Trajectory(stamps, T, np.zeros((len(T), 6, 6)), np.zeros((len(T), 6, 6))).motions()
     if "sigmas" in values:
-        sigmas = [_six(to_numbers(r), _place(r)) for r in _rows_beside(table, "sigmas", rows, 6)]
+        beside = _rows_beside(table, "sigmas", rows, 6)
+        sigmas = [_six(s, row.place) for s, row in zip(tables.to_numbers(beside, 6), beside, strict=True)]
         moved = [MotionReading(v, np.diag(sigmas[i] ** 2)) for v, i in zip(steps.vec, keep[1:], strict=True)]
         stream = Stream(name, "odometry", stamps, [MotionReading(None), *moved], has_scale=has_scale, notes=notes)
         return Log(rows[0].file, {name: stream}, epoch_ns)
@@ -139,102 +137,14 @@ def open_table(table: SensorTable) -> Log:
     return Log(rows[0].file, {name: stream}, epoch_ns)
 
 
-class Row(NamedTuple):
-    """One row of a text table, and where it is."""
-
-    file: Path
-    line: int
-    words: list[str]
-
-
-def table_file(table: SensorTable, key: str) -> Path:
-    """The file that a key of a rig.toml table names. Raises DataError if it names none."""
-    value = table.values.get(key)
-    if not isinstance(value, str):
-        raise DataError(f'sensor {table.name}: its table in rig.toml needs a line {key} = "FILE"')
-    file = table.folder / value
-    if not file.is_file():
-        raise DataError(f"sensor {table.name}: {key} = {value!r}, but there is no file {file}; correct the path")
-    return file
-
-
-def read_rows(file: Path, fewest: int, most: int) -> list[Row]:
-    """Rows of a table parted by commas or blanks, without empty lines and # comments. Raises DataError."""
-    try:
-        lines = file.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as e:
-        raise DataError(f"{file} can not be read as text ({type(e).__name__}); name a text file") from e
-    kept = [(k, text) for k, line in enumerate(lines, start=1) if (text := line.partition("#")[0].strip())]
-    rows = [Row(file, k, [w.strip() for w in t.split(",")] if "," in t else t.split()) for k, t in kept]
-    for row in rows:
-        if not fewest <= len(row.words) <= most:
-            wanted = f"{fewest}" if fewest == most else f"{fewest} to {most}"
-            raise DataError(f"{_place(row)}: {len(row.words)} columns where {wanted} belong; correct or remove it")
-    if not rows:
-        raise DataError(f"{file} holds no rows; name a file that does")
-    return rows
-
-
-def to_numbers(row: Row) -> list[float]:
-    """What is written in a row, nan where nothing is. Raises DataError."""
-    try:
-        return [float(w or "nan") for w in row.words]
-    except ValueError as e:
-        raise DataError(f"{_place(row)}: {e}; every column must hold a number") from e
-
-
-def to_nanoseconds(row: Row, unit: str = "1") -> int | None:
-    """The first column, in units of ``unit`` seconds, as exact nanoseconds; None if it is nan. Raises DataError."""
-    try:
-        stamp = Decimal(row.words[0] or "nan") * Decimal(unit)
-    except InvalidOperation as e:
-        raise DataError(f"{_place(row)}: '{row.words[0]}' is not a stamp; correct or remove the row") from e
-    if stamp.is_finite() and abs(stamp) > 9 * 10**9:
-        raise DataError(f"{_place(row)}: the stamp {row.words[0]} is beyond any clock; convert it to the right unit")
-    return round(stamp * 10**9) if stamp.is_finite() else None
-
-
-def usable_rows(
-    stamps_ns: Sequence[int | None], numbers: Array, rows: Sequence[Row]
-) -> tuple[list[int], tuple[str, ...]]:
-    """Indices of the rows that are whole and whose stamps increase, and a sentence on those left out.
-
-    Raises DataError if fewer than two are left, or fewer than half.
-    """
-    whole = np.array([s is not None for s in stamps_ns]) & np.isfinite(numbers).all(axis=1)
-    index = np.flatnonzero(whole)
-    ns = np.array([stamps_ns[i] for i in index.tolist()], dtype=np.int64)
-    limits = np.iinfo(np.int64)
-    after_all = ns > np.maximum.accumulate(np.append(limits.min, ns))[:-1]
-    before_all = ns < np.minimum.accumulate(np.append(limits.max, ns[::-1]))[-2::-1]
-    rising = after_all if after_all.sum() >= before_all.sum() else before_all  # one leap ahead costs only itself
-    keep = index[rising].tolist()
-    unusable = {
-        "hold nan or nothing": np.flatnonzero(~whole),
-        "have a stamp that goes back or repeats": index[~rising],
-    }
-    notes = tuple(
-        f"{rows[0].file}: {len(which)} of {len(rows)} rows {what}, the first in line {rows[which[0]].line}; left out"
-        for what, which in unusable.items()
-        if len(which)
-    )
-    if len(keep) < max(2, len(rows) / 2):
-        raise DataError(" and ".join(notes) or f"{rows[0].file} has one row; a motion takes two")
-    return keep, notes
-
-
-def _place(row: Row) -> str:
-    return f"{row.file}, line {row.line}"
-
-
-def _rows_beside(table: SensorTable, key: str, rows: Sequence[Row], columns: int) -> list[Row]:
-    others = read_rows(table_file(table, key), columns, columns)
+def _rows_beside(table: SensorTable, key: str, rows: Sequence[tables.Row], columns: int) -> list[tables.Row]:
+    others = tables.read_rows(tables.table_file(table, key), columns, columns)
     if len(others) != len(rows):
         raise DataError(f"{others[0].file} has {len(others)} rows and {rows[0].file} {len(rows)}; give one each")
     return others
 
 
-def _poses(style: str, numbers: Array, rows: Sequence[Row]) -> Array:
+def _poses(style: str, numbers: Array, rows: Sequence[tables.Row]) -> Array:
     """(n, 4, 4) poses; refuses what is further than 1 % from a rotation, and normalises the rest."""
     if style == "kitti":
         M = numbers.reshape(-1, 3, 4)
@@ -246,7 +156,7 @@ def _poses(style: str, numbers: Array, rows: Sequence[Row]) -> Array:
         bad = np.abs(np.linalg.norm(q, axis=1) - 1.0) > 0.01
     if bad.any():
         what = "matrix is no rotation" if style == "kitti" else "quaternion is not of length one"
-        raise DataError(f"{_place(rows[int(np.argmax(bad))])}: the {what}; is format = '{style}' right?")
+        raise DataError(f"{rows[int(np.argmax(bad))].place}: the {what}; is format = '{style}' right?")
     rotation = Rotation.from_matrix(R) if style == "kitti" else Rotation.from_quat(q, scalar_first=style == "euroc")
     return se3.rigid(rotation.as_matrix(), t)
 

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_toolkit import DataError, LazyReadings, Log, Motions, Scan, Sensor, SensorTable, Stream, hookimpl, se3
+from calib_toolkit import DataError, Motions, Sensor, SensorTable, hookimpl, se3, tables
+from calib_toolkit.types import LazyReadings, Log, Scan, Stream
 from calib_toolkit_plugins import registration
 from calib_toolkit_plugins.registration import Surface
 
@@ -171,63 +172,25 @@ def open_table(table: SensorTable) -> Log:
     will ``turns = "clockwise"`` (seen from above) or ``"counterclockwise"``, which gives each point its time
     from its azimuth, the stamp being when the scanner looks along x.
     """
-    where, values = f"sensor {table.name}", table.values
-    unknown = [key for key in values if key not in KEYS]
-    if unknown:
-        raise DataError(f"{where}: there is no key '{unknown[0]}' for a velodyne; there are: {', '.join(KEYS)}")
-    folder, times = (_path(table, key) for key in ("scans", "times"))
-    turns = values.get("turns")
+    tables.refuse_unknown(table, KEYS)
+    where, turns = f"sensor {table.name}", table.values.get("turns")
+    folder, times = tables.table_folder(table, "scans"), tables.table_file(table, "times")
     if turns is not None and turns not in TURNS:
         raise DataError(f"{where}: turns = {turns!r} is not known; write one of {', '.join(TURNS)}, or leave it out")
-    if not folder.is_dir():
-        raise DataError(f"{where}: {folder} is not a folder; let 'scans' name the folder of its scans")
     files = sorted(f for f in folder.iterdir() if f.suffix in SUFFIXES)
     if not files:
         raise DataError(f"{where}: {folder} holds no scans ({', '.join(SUFFIXES)})")
-    nanoseconds = _stamps(times, where)
-    if len(nanoseconds) != len(files):
-        raise DataError(
-            f"{where}: {times} holds {len(nanoseconds)} stamps and {folder} {len(files)} scans; each needs one"
-        )
-    stamps = (nanoseconds - nanoseconds[0]) * 1e-9
+    ns = tables.read_stamps(times)
+    if len(ns) != len(files):
+        raise DataError(f"{where}: {times} holds {len(ns)} stamps and {folder} {len(files)} scans; each needs one")
+    if tables.BLANK in ns:
+        line = ns.tolist().index(tables.BLANK) + 1
+        raise DataError(f"{where}: {times}, line {line} holds no stamp; write one, or remove it and its scan")
+    stamps = tables.seconds(ns, int(ns[0]))
     period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     load = partial(_load, rate=TURNS[turns] * period / (2 * np.pi) if turns else None)
     stream = Stream(table.name, "velodyne", stamps, LazyReadings(load, files))
-    return Log(times, {table.name: stream}, int(nanoseconds[0]))
-
-
-def _path(table: SensorTable, key: str) -> Path:
-    value = table.values.get(key)
-    if not isinstance(value, str):
-        raise DataError(f"sensor {table.name} lacks the key '{key}'; add it, a path in quotes")
-    return table.folder / Path(value).expanduser()
-
-
-def _stamps(file: Path, where: str) -> NDArray[np.int64]:
-    """(n,) nanoseconds of unix time, of one line each."""
-    try:
-        lines = [line.strip() for line in file.read_text(encoding="utf-8").splitlines()]
-    except (OSError, UnicodeDecodeError) as e:
-        raise DataError(f"{where}: {file} can not be read ({e}); let 'times' name a text file of stamps") from e
-    while lines and not lines[-1]:
-        lines.pop()
-    stamps = np.zeros(len(lines), dtype=np.int64)
-    for i, line in enumerate(lines):
-        try:
-            stamps[i] = _nanoseconds(line)
-        except (ValueError, OverflowError, ArithmeticError) as e:
-            raise DataError(
-                f"{where}: {file}, line {i + 1}, '{line}' is not a stamp; write seconds or YYYY-MM-DD hh:mm:ss"
-            ) from e
-    return stamps
-
-
-def _nanoseconds(line: str) -> int:
-    if "-" in line[1:] and ":" in line:
-        return int(np.datetime64(line, "ns").astype(np.int64))
-    from decimal import Decimal
-
-    return int((Decimal(line) * 10**9).to_integral_value())
+    return Log(times, {table.name: stream}, int(ns[0]))
 
 
 def _load(file: Path, rate: float | None) -> Scan:

@@ -137,6 +137,16 @@ def test_the_uncertainty_is_the_curvature_of_the_likelihood():
     assert_allclose(np.linalg.inv(curvature), rotation.uncertainty(R, steps, ALL)[3:, 3:], rtol=1e-3, atol=1e-12)
 
 
+def test_three_equal_sensors_are_as_uncertain_as_algebra_says():
+    """The base's noise is common to both others: variances 2, covariance 1, in units of one sensor's share."""
+    steps, R = exact(MOUNTS[:3]), in_base(MOUNTS[:3])[:, :3, :3]
+    S = se3.skew(steps.vec[0, :, 3:])
+    one = SIGMA[5] ** 2 * np.linalg.inv(np.einsum("mia,mib->ab", S, S))
+    assert_allclose(
+        rotation.uncertainty(R, steps, ALL)[3:, 3:], np.kron([[2, 1], [1, 2]], one), rtol=1e-6, atol=1e-15
+    )
+
+
 def test_errors_are_as_large_as_stated_when_nothing_is_trimmed():
     """30 drives of 40 s, two sensors: 0.96 measured; the ideal of one has a spread of 0.15."""
     R, found = in_base(MOUNTS[:2])[:, :3, :3], []

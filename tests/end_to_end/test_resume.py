@@ -36,7 +36,7 @@ def load(file):
         raise DataError(f"{file}: sensor slow, frame {int(file.stem)}, can not be read; copy it again") from e
 
 def estimate(stream, options):
-    time.sleep(PAUSE)
+    time.sleep(0.2 * Path(COUNTER).with_suffix(".slowly").exists())
     rows = np.array([stream.readings[i] for i in range(len(stream))])
     with Path(COUNTER).open("a") as f:
         f.write(f"{stream.name} {stream.stamps[0]:.3f}\\n")
@@ -81,9 +81,9 @@ class Case:
                 text = " ".join(f"{x:.9f}" for x in (k, *row))
                 (self.drive / name / f"{k:06d}.txt").write_text(text)
 
-    def plugin(self, version="1", pause=0.0):
+    def plugin(self, version="1"):
         """(Re)write the plugin file."""
-        text = PLUGIN.replace("COUNTER", repr(str(self.counter))).replace("PAUSE", str(pause))
+        text = PLUGIN.replace("COUNTER", repr(str(self.counter)))
         (self.folder / "slow.py").write_text(text.replace("VERSION", version).replace("CHUNK", str(CHUNK)))
 
     def arguments(self, out="out", jobs=1, *more):
@@ -135,7 +135,8 @@ def test_the_result_does_not_depend_on_the_slices_being_stored(case, monkeypatch
 
 
 def test_a_kill_half_way_costs_the_slice_at_hand(case):
-    case.plugin(pause=0.2)
+    slowly = case.counter.with_suffix(".slowly")
+    slowly.touch()
     code = "from calib_toolkit.cli import main; main()"
     running = subprocess.Popen([sys.executable, "-c", code, *case.arguments()], stderr=subprocess.DEVNULL)
     try:
@@ -149,7 +150,7 @@ def test_a_kill_half_way_costs_the_slice_at_hand(case):
     assert 5 <= kept < 2 * SLICES
     assert not (case.folder / "out/calibration.json").exists()
     asked = case.asked()
-    case.plugin()
+    slowly.unlink()
     case.run()
     again = case.asked()
     assert again.total() == 2 * SLICES - kept

@@ -257,11 +257,18 @@ def test_no_folder_is_written_unless_asked_for(drive, tmp_path, monkeypatch):
 # ---- what a plane does not tell
 
 
-def test_what_was_not_determined_is_null_with_a_direction_and_a_sentence(run, tmp_path):
-    (tmp_path / "simulated.toml").write_text(DRIVE.replace('"rough"', '"planar"'))
-    status, printed, text = run(drive=tmp_path)
+@pytest.fixture(scope="module")
+def planar(run, tmp_path_factory):
+    """A drive on a plane: (what was printed, the file's content as text)."""
+    folder = tmp_path_factory.mktemp("planar")
+    (folder / "simulated.toml").write_text(DRIVE.replace('"rough"', '"planar"'))
+    status, printed, text = run(drive=folder)
     assert status == 3, printed
-    found = json.loads(text)
+    return printed, text
+
+
+def test_what_was_not_determined_is_null_with_a_direction_and_a_sentence(planar):
+    printed, found = planar[0], json.loads(planar[1])
     assert found["undetermined"]
     order = found["covariance"]["order"]
     matrix = as_array(found["covariance"]["matrix"])
@@ -279,9 +286,8 @@ def test_what_was_not_determined_is_null_with_a_direction_and_a_sentence(run, tm
     assert np.isfinite(matrix[order.index("ins.dt"), order.index("ins.dt")])
 
 
-def test_a_null_stays_a_null_when_read_back(run, tmp_path):
-    (tmp_path / "simulated.toml").write_text(DRIVE.replace('"rough"', '"planar"'))
-    (tmp_path / "calibration.json").write_text(run(drive=tmp_path)[2])
+def test_a_null_stays_a_null_when_read_back(planar, tmp_path):
+    (tmp_path / "calibration.json").write_text(planar[1])
     c = read_calibration(tmp_path / "calibration.json")
     assert not c.determined[c.index("ins"), 2]
     assert np.isnan(c.sigma[c.index("ins"), 2])

@@ -188,7 +188,7 @@ def test_rows_that_can_not_be_used_are_left_out_with_a_note(tmp_path: Path) -> N
     [
         ("1,49,8.4,115,0,0,0\n2,49,8.4,115,0,0,0", "its first line must be stamp,lat_deg"),
         (HEADER.replace("lat_deg,lon_deg", "lon_deg,lat_deg") + "\n1,8.4,49,115,0,0,0", "its first line must be"),
-        (HEADER, "holds no fixes"),
+        (HEADER, "holds no rows below its titles"),
         (HEADER + "\n1,49,8.4,115,0,0,0\n2,49,8.4,115,0,0", "line 3: 6 columns where"),
         (HEADER + "\n1,49,8.4,115,0,0,north", "line 2: could not convert string to float: 'north'"),
     ],

@@ -77,7 +77,7 @@ def test_each_head_has_its_own_mask(tmp_path: Path) -> None:
         ({"heads": "cam0"}, "sensor lb needs 'heads'"),
         ({"heads": [{"images": "cam0"}]}, "sensor lb0 has no camera_matrix"),
         ({"heads": [{"images": "cam0", "camera_matrix": K, "focus": 1}]}, "sensor lb0 has the key 'focus'"),
-        ({"times": "no.txt"}, r"sensor lb: there is no .*no\.txt"),
+        ({"times": "no.txt"}, r"sensor lb: times = 'no.txt', but there is no file .*no\.txt"),
         ({"clock": "gps"}, "sensor lb has the key 'clock'"),
     ],
 )

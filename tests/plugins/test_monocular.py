@@ -218,9 +218,9 @@ def test_a_camera_in_a_rig(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"images": None}, "sensor left needs 'images'"),
-        ({"images": "nowhere"}, "sensor left: there is no .*nowhere"),
-        ({"times": None}, "sensor left needs 'times'"),
+        ({"images": None}, "sensor left needs images = "),
+        ({"images": "nowhere"}, "sensor left: images = 'nowhere', but there is no folder .*nowhere"),
+        ({"times": None}, "sensor left needs times = "),
         ({"camera_matrix": None}, "sensor left has no camera_matrix"),
         ({"camera_matrix": [1.0, 2.0]}, "left: camera_matrix has 2 numbers"),
         ({"camera_matrix": ["a"] * 9}, "left: camera_matrix must be"),
@@ -237,8 +237,10 @@ def test_a_rig_table_that_is_wrong_is_refused_by_name(tmp_path: Path, change: di
     ("lines", "sentence"),
     [
         ("0.1\n0.2\n", "2 stamps for 3 images numbered 7 to 9"),
-        ("0.1\nhalf past\n0.3\n", "line 2 "),
-        ("", "holds no stamps"),
+        ("0.1\nhalf past\n0.3\n", "line 2: 'half past' is neither"),
+        ("", "holds no rows"),
+        ("7 0.1\n8 nan\n9 0.3\n", "line 2 holds no stamp"),
+        ("0.1\n2011-13-26 13:02:25\n0.3\n", "line 2: .* is not a stamp"),
         ("7 0.1\n9 0.3\n", "no stamp for image 8"),
     ],
 )

@@ -246,7 +246,7 @@ def test_quaternions_close_to_unit_are_normalised_and_others_refused(tmp_path: P
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"poses": None}, 'needs a line poses = "FILE"'),
+        ({"poses": None}, 'sensor slam needs poses = "FILE"'),
         ({"poses": "absent.txt"}, "there is no file .*absent.txt; correct the path"),
         ({"poses": "image.png"}, "can not be read as text"),
         ({"poses": "empty.txt"}, "holds no rows"),
@@ -258,7 +258,7 @@ def test_quaternions_close_to_unit_are_normalised_and_others_refused(tmp_path: P
         ({"motion_sigma": [0.1, 0.1, 0.1, 0, 0, 0]}, "motion_sigma must be six positive numbers"),
         ({"motion_sigma": "small"}, "motion_sigma must be six positive numbers"),
         ({"sigmas": "short.txt"}, "short.txt has 1 rows and .*poses.txt 20; give one each"),
-        ({"poze": "x"}, "has no key 'poze'; it may have poses, format"),
+        ({"poze": "x"}, "has the key 'poze', which is unknown here; it may have poses, format"),
         ({"poses": "cut.txt"}, "cut.txt, line 2: 5 columns where 8 belong"),
         ({"poses": "words.txt"}, "words.txt, line 1: 'now' is not a stamp"),
         ({"poses": "milliseconds.txt"}, "milliseconds.txt, line 1: the stamp 1317646534939 is beyond any clock"),

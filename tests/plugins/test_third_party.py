@@ -127,18 +127,26 @@ def test_without_it_the_rig_is_refused_with_the_kinds_there_are(tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    "text", ["stamp,speed,yaw_rate\n1,2\n", "stamp,speed,yaw_rate\n1,fast,0\n", "stamp,speed,yaw_rate\nnow,1,0\n"]
+    ("text", "sentence"),
+    [
+        ("1,2\n", "line 2: 2 columns where 3 belong"),
+        ("1,fast,0\n", "line 2: could not convert string to float: 'fast'"),
+        ("now,1,0\n", "line 2: 'now' is not a stamp"),
+        ("", "holds no rows below its titles"),
+        ("1,2,0\n1,2,0\n1,2,0\n", "2 of 3 rows have a stamp that goes back or repeats"),
+    ],
 )
-def test_what_is_not_a_table_of_rates_is_refused(tmp_path: Path, text: str) -> None:
-    (tmp_path / "wheels.csv").write_text(text)
-    with pytest.raises(
-        DataError, match=r"sensor wheels: rates = .*wheels\.csv is not a file of stamp,speed,yaw_rate"
-    ):
+def test_what_is_not_a_table_of_rates_is_refused(tmp_path: Path, text: str, sentence: str) -> None:
+    (tmp_path / "wheels.csv").write_text("stamp,speed,yaw_rate\n" + text)
+    with pytest.raises(DataError, match=rf"wheels\.csv.* {sentence}"):
         WHEELS.open_table(SensorTable("wheels", tmp_path, {"rates": "wheels.csv"}))
 
 
-def test_rates_that_are_not_numbers_are_refused(tmp_path: Path) -> None:
+def test_rates_that_are_not_numbers_are_left_out_of_a_table_and_refused_elsewhere(tmp_path: Path) -> None:
     (tmp_path / "wheels.csv").write_text("stamp,speed,yaw_rate\n1,2,0\n1.5,nan,0\n2,2,0\n")
     stream = WHEELS.open_table(SensorTable("wheels", tmp_path, {"rates": "wheels.csv"})).streams["wheels"]
+    assert stream.stamps.tolist() == [0.0, 1.0]
+    assert "1 of 3 rows hold nan or nothing, the first in line 3" in stream.notes[0]
+    stream = Stream("wheels", "wheel_odometry", np.array([0.0, 0.5, 1.0]), [(2, 0), (np.nan, 0), (2, 0)])
     with pytest.raises(DataError, match=r"sensor wheels: its rates at 0\.500 s are not numbers"):
         WHEELS.estimate(stream, WHEELS.options())

@@ -321,15 +321,15 @@ def test_scans_in_formats_of_open3d(tmp_path: Path, suffix: str) -> None:
 @pytest.mark.parametrize(
     ("values", "sentence"),
     [
-        ({"scan": "x"}, "no key 'scan'"),
-        ({"times": 3}, "lacks the key 'times'"),
+        ({"scan": "x"}, "velo has the key 'scan', which is unknown here; it may have scans, times, turns"),
+        ({"times": 3}, "sensor velo needs times = "),
         ({"turns": "left"}, "turns = 'left' is not known"),
-        ({"scans": "nowhere"}, "is not a folder"),
+        ({"scans": "nowhere"}, "sensor velo: scans = 'nowhere', but there is no folder .*nowhere"),
         ({"scans": "."}, "holds no scans"),
-        ({"times": "nowhere.txt"}, "nowhere.txt can not be read"),
+        ({"times": "nowhere.txt"}, "sensor velo: times = 'nowhere.txt', but there is no file .*nowhere.txt"),
         ({"times": "short.txt"}, "holds 2 stamps and .* 3 scans"),
-        ({"times": "blank.txt"}, "line 2, '' is not a stamp"),
-        ({"times": "infinite.txt"}, "line 1, 'inf' is not a stamp"),
+        ({"times": "blank.txt"}, "blank.txt, line 2 holds no stamp"),
+        ({"times": "infinite.txt"}, "infinite.txt, line 1 holds no stamp"),
     ],
 )
 def test_bad_tables_are_refused(recorded: Path, values: dict[str, object], sentence: str) -> None:

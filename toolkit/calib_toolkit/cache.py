@@ -1,12 +1,12 @@
 """Motions that were estimated before, kept on disk under a hash of everything they came from."""
 
 import os
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
+from functools import partial
 from pathlib import Path
+from types import FunctionType, MethodType
 from typing import Any
-from zipfile import BadZipFile
 from zlib import crc32
 
 import joblib
@@ -34,13 +34,13 @@ def key_of(*parts: Any) -> str:
 def load(folder: Path, key: str) -> tuple[Motions | Trajectory, tuple[str, ...]] | None:
     """What was stored under a key, or None; a damaged file counts as none."""
     try:
-        with np.load(_file(folder, key), allow_pickle=False) as stored:
+        with _file(folder, key).open("rb") as file, np.load(file, allow_pickle=False) as stored:
             kind = {"Motions": Motions, "Trajectory": Trajectory}[str(stored["kind"])]
             values = {f.name: stored[f.name] for f in fields(kind)}
             if "has_scale" in values:
                 values["has_scale"] = bool(values["has_scale"])
             return kind(**values), tuple(str(n) for n in stored["notes"])
-    except (OSError, KeyError, ValueError, EOFError, BadZipFile, zlib.error):
+    except Exception:  # whatever a damaged file makes of itself, the motion can be estimated again
         return None
 
 
@@ -66,7 +66,11 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Path):
         return _signature(value)
     if isinstance(value, LazyReadings):
-        return [value.load, [_plain(k) for k in value.keys]]
+        return [_plain(value.load), [_plain(k) for k in value.keys]]
+    if isinstance(value, partial):
+        return [_plain(value.func), _plain(value.args), _plain(value.keywords)]
+    if isinstance(value, FunctionType | MethodType):
+        return f"{value.__module__}.{value.__qualname__}"  # a loose file's functions can not be pickled by name
     if isinstance(value, Mapping):
         return {k: _plain(v) for k, v in value.items()}
     if is_dataclass(value) and not isinstance(value, type):

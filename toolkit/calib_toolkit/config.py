@@ -51,6 +51,8 @@ class Config:
             raise ConfigError(f"there is no method '{self.method}'; there are: {', '.join(METHODS)}")
         if self.timing.start not in ("correlation", "zero"):
             raise ConfigError(f"timing.start = '{self.timing.start}' is neither 'correlation' nor 'zero'")
+        if not isinstance(self.base, str | None):
+            raise ConfigError(f"base = {self.base!r} is not the name of a sensor")
         for name, value, least, below in (
             ("start", self.start, 0.0, np.inf),
             ("duration", 1.0 if self.duration is None else self.duration, TINY, np.inf),

@@ -21,6 +21,8 @@ THRESHOLD = 8.0
 """Standard deviations of noise: without any motion the best of several directions, or of many lags, reaches four."""
 VAGUE_TURN_DEG, VAGUE_SHIFT = 5.0, 1.0
 """A sigma above these (degrees, metres) tells nothing: a ruler does better."""
+CLIP = 2.0
+"""Readings count as if they were no longer than so many times what two sensors commonly disagree by."""
 COMMON = 0.3
 """Least correlation of the two sensors' readings: below it an estimate is biased by noise, however long the drive."""
 
@@ -36,6 +38,8 @@ def unmeasured_times(names: Sequence[str], chains: Sequence[Chain], clocks: Sequ
     slope = np.diff(angle, axis=1)
     known = np.isfinite(slope).all(axis=0)
     slope = slope[:, known, None]
+    if not known.any():
+        slope = np.zeros((len(names), 1, 1))
     measured = {clocks[0], *(c for c, other in zip(clocks, slope, strict=True) if _stand_out(slope[0], other, 12.0))}
     return [
         Undetermined(
@@ -150,6 +154,11 @@ def _stand_out(a: Array, b: Array, kurtosis: float) -> bool:
     If both were noise, the variance of ``a . b`` would be at most ``E |a - b|^4 / kurtosis``: 12 in one
     dimension, 16 in two, reached when both are equally noisy.
     """
+    noise = np.sqrt(np.median(np.einsum("mi,mi->m", a - b, a - b)))
+    if noise > 0:  # readings that are wrong at the same time, by chance, must not count for much
+        a, b = (
+            v * np.minimum(1.0, CLIP * noise / np.linalg.norm(v, axis=1, keepdims=True).clip(1e-300)) for v in (a, b)
+        )
     product = float(np.einsum("mi,mi->", a, b))
     spread = np.sqrt((np.einsum("mi,mi->m", a - b, a - b) ** 2).sum() / kurtosis)
     power = np.sqrt(float((a**2).sum()) * float((b**2).sum()))

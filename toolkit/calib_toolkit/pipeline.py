@@ -18,6 +18,8 @@ from calib_toolkit.types import Log, Motions, Result, Undetermined
 Array = NDArray[np.float64]
 
 STAGES = "timing, rotation, translation"
+LARGEST_VEHICLE = 20.0
+"""Metres: no two sensors are further apart."""
 FEWEST_STEPS = 20
 """Common steps below which nothing is worth estimating."""
 
@@ -158,12 +160,13 @@ def _check_steps(steps: sync.Steps) -> None:
 
 
 def _check_lengths(names: Sequence[str], steps: sync.Steps) -> None:
-    """Refuse sensors that measure in different units: of all rigid points none goes twice as far as another."""
+    """Refuse sensors that measure in different units: points of one vehicle go equally far, but for its turning."""
     length = np.linalg.norm(steps.vec[..., :3], axis=-1).sum(axis=1)
     noise = np.sqrt(np.trace(steps.cov[..., :3, :3], axis1=-2, axis2=-1)).sum(axis=1)
+    by_turning = LARGEST_VEHICLE * np.linalg.norm(steps.vec[0, :, 3:], axis=-1).sum()
     for i, name in enumerate(names[1:], start=1):
-        ratio = length[i] / max(length[0], 1e-9)
-        if steps.has_scale[i] and length[i] + length[0] > 4 * (noise[i] + noise[0]) and not 0.5 < ratio < 2.0:
+        apart = abs(length[i] - length[0]) - 4 * (noise[i] + noise[0]) - by_turning
+        if steps.has_scale[i] and length[i] > 0 and apart > 0.5 * min(length[i], length[0]):
             raise DataError(
                 f"sensor {name} says it drove {length[i]:.4g} m where {names[0]} says {length[0]:.4g} m, so one of "
                 "them is not in metres; convert it, or state has_scale = false"

@@ -4,11 +4,12 @@ import importlib.util
 import inspect
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import Distribution, distributions
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar, cast
+from zlib import crc32
 
 import pluggy
 
@@ -17,6 +18,8 @@ from calib_toolkit.hookspecs import CostMetric, Dataset, Exporter, HookSpecs, Me
 from calib_toolkit.types import Log
 
 GROUP = "calib_toolkit"
+FILE = "(file)"
+"""What stands for the distribution of a plugin given as one file."""
 HOOKS = {
     "calib_register_sensors": "sensor",
     "calib_register_metrics": "metric",
@@ -123,7 +126,7 @@ def _found(files: Iterable[Path]) -> Iterable[tuple[str, str, str, Callable[[], 
                 seen.add(key)
                 yield f"{point.value} of {_name(dist)}", _name(dist), dist.version, point.load
     for file in files:
-        yield str(file), "(file)", "-", lambda file=file: _module_from(file)  # type: ignore[misc]
+        yield str(file), FILE, "-", lambda file=file: _module_from(file)  # type: ignore[misc]
 
 
 def _name(dist: Distribution) -> str:
@@ -178,6 +181,8 @@ def _brought(
         for item in _items(impl.function, label, caller.name):
             if not isinstance(getattr(item, "id", None), str):
                 raise PluginError(f"plugin {label}: what {caller.name} returns must have an id that is a string")
+            if dist == FILE and isinstance(item, Sensor):  # a loose file changes without a new version
+                item = replace(item, version=f"{item.version}+{crc32(Path(inspect.getfile(module)).read_bytes())}")
             yield Entry(item.id, HOOKS[caller.name], item, dist, version, inspect.getfile(module))
 
 

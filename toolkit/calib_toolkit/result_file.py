@@ -67,23 +67,33 @@ def calibration_dict(c: Calibration) -> dict[str, Any]:
 def read_calibration(file: Path) -> Calibration:
     """The best calibration of a file that :func:`write_result` wrote. Raises DataError."""
     try:
-        d = json.loads(file.read_text())
-        sensors = d["sensors"]
-        names = tuple(sensors)
-        sigma = np.array([[s["sigma"][p] for p in PARAMETERS] for s in sensors.values()], dtype=float)
-        return Calibration(
-            d["base"],
-            names,
-            np.array([s["T_base_sensor"] for s in sensors.values()], dtype=float),
-            np.nan_to_num(np.array([s["dt_base_sensor"] for s in sensors.values()], dtype=float)),
-            np.nan_to_num(np.array(d["covariance"]["matrix"], dtype=float)),
-            np.array([s["has_scale"] for s in sensors.values()]),
-            np.isfinite(sigma),
-            tuple(Undetermined(u["direction"], u["sentence"]) for u in d["undetermined"]),
-            np.array([s["clock_skew"] for s in sensors.values()], dtype=float),
-        )
-    except (OSError, KeyError, TypeError, ValueError) as e:
+        return _calibration(json.loads(file.read_text()))
+    except (OSError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as e:
         raise DataError(f"{file} is not a calibration this program wrote ({type(e).__name__}: {e})") from e
+
+
+def _calibration(d: dict[str, Any]) -> Calibration:
+    names, sensors = tuple(d["sensors"]), list(d["sensors"].values())
+    n, order = len(names), [f"{name}.{p}" for name in d["sensors"] for p in PARAMETERS]
+    sigma = np.array([[s["sigma"][p] for p in PARAMETERS] for s in sensors], dtype=float)
+    poses = np.array([s["T_base_sensor"] for s in sensors], dtype=float)
+    cov = np.array(d["covariance"]["matrix"], dtype=float)
+    if d["base"] not in names or d["covariance"]["order"] != order:
+        raise ValueError("its base or the order of its covariance does not fit its sensors")
+    if poses.shape != (n, 4, 4) or cov.shape != (7 * n, 7 * n):
+        raise ValueError(f"poses of shape {poses.shape} and a covariance of shape {cov.shape} for {n} sensors")
+    return Calibration(
+        d["base"],
+        names,
+        poses,
+        np.nan_to_num(np.array([s["dt_base_sensor"] for s in sensors], dtype=float)),
+        np.nan_to_num(cov),
+        np.array([s["has_scale"] for s in sensors], dtype=bool),
+        np.isfinite(sigma),
+        tuple(Undetermined(dict(u["direction"]), str(u["sentence"])) for u in d["undetermined"]),
+        np.array([s["clock_skew"] for s in sensors], dtype=float),
+        float(sensors[0]["t_ref"]),
+    )
 
 
 def _plain(a: Any) -> Any:

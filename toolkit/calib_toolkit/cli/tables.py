@@ -75,7 +75,8 @@ def _euler(R: Array) -> Array:
 
 def _rebased(reference: Calibration, base: str, name: str) -> Array:
     T = reference.between(base, name).T_a_b
-    dt = reference.dt_between(base, name)[0] if np.all(np.isfinite(reference.dt_base_sensor)) else np.nan
+    timed = reference.determined[[reference.index(base), reference.index(name)], 6].all()
+    dt = reference.dt_between(base, name)[0] if timed else np.nan
     return np.concatenate([T[:3, 3], np.degrees(_euler(T[:3, :3])), [1e3 * dt]])
 
 
