@@ -17,14 +17,14 @@ from calib_toolkit.types import Undetermined
 
 Array = NDArray[np.float64]
 
-THRESHOLD = 8.0
+THRESHOLD = 6.0
 """Standard deviations of noise: without any motion the best of several directions, or of many lags, reaches four."""
 VAGUE_TURN_DEG, VAGUE_SHIFT = 5.0, 1.0
 """A sigma above these (degrees, metres) tells nothing: a ruler does better."""
 CLIP = 2.0
 """Readings count as if they were no longer than so many times what two sensors commonly disagree by."""
 COMMON = 0.3
-"""Least correlation of the two sensors' readings: below it an estimate is biased by noise, however long the drive."""
+"""Least correlation of two sensors' readings along a direction: below it noise biases what is estimated there."""
 
 
 def unmeasured_times(names: Sequence[str], chains: Sequence[Chain], clocks: Sequence[Hashable]) -> list[Undetermined]:
@@ -40,7 +40,10 @@ def unmeasured_times(names: Sequence[str], chains: Sequence[Chain], clocks: Sequ
     slope = slope[:, known, None]
     if not known.any():
         slope = np.zeros((len(names), 1, 1))
-    measured = {clocks[0], *(c for c, other in zip(clocks, slope, strict=True) if _stand_out(slope[0], other, 12.0))}
+    measured = {
+        clocks[0],
+        *(c for c, other in zip(clocks, slope, strict=True) if _stand_out(slope[0], other, 12.0, 0.0)),
+    }
     return [
         Undetermined(
             {f"{name}.dt": 1.0},
@@ -145,10 +148,10 @@ def _null_directions(w_base: Array, w_sensor: Array, keep: Array) -> Array:
     by_base, by_sensor = keep @ se3.skew(w_base), keep @ se3.skew(w_sensor)
     excitation = np.einsum("mia,mib->ab", by_base, by_sensor)
     _, vectors = np.linalg.eigh(0.5 * (excitation + excitation.T))
-    return np.array([v for v in vectors.T if not _stand_out(by_base @ v, by_sensor @ v, 16.0)]).reshape(-1, 3)
+    return np.array([v for v in vectors.T if not _stand_out(by_base @ v, by_sensor @ v, 16.0, COMMON)]).reshape(-1, 3)
 
 
-def _stand_out(a: Array, b: Array, kurtosis: float) -> bool:
+def _stand_out(a: Array, b: Array, kurtosis: float, common: float) -> bool:
     """Whether two noisy readings (m, d) of one signal hold any: their product against its spread if they did not.
 
     If both were noise, the variance of ``a . b`` would be at most ``E |a - b|^4 / kurtosis``: 12 in one
@@ -162,7 +165,7 @@ def _stand_out(a: Array, b: Array, kurtosis: float) -> bool:
     product = float(np.einsum("mi,mi->", a, b))
     spread = np.sqrt((np.einsum("mi,mi->m", a - b, a - b) ** 2).sum() / kurtosis)
     power = np.sqrt(float((a**2).sum()) * float((b**2).sum()))
-    return product > THRESHOLD * spread and product > COMMON * power
+    return product > THRESHOLD * spread and product > common * power
 
 
 def _weight(steps: Steps, i: int) -> Array:
