@@ -7,21 +7,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_toolkit import assembly, cache, observability, rotation, sync, timing, translation
+from calib_toolkit import assembly, cache, checks, observability, rotation, sync, timing, translation
 from calib_toolkit.config import Config
-from calib_toolkit.errors import ConfigError, DataError, NotObservableError
+from calib_toolkit.errors import ConfigError, DataError
 from calib_toolkit.estimation import SensorMotion, estimate_motions
 from calib_toolkit.plugins import Registry, registry
 from calib_toolkit.progress import Progress, Silent
-from calib_toolkit.types import Log, Motions, Result, Undetermined
+from calib_toolkit.types import Log, Motions, Result
 
 Array = NDArray[np.float64]
 
 STAGES = "timing, rotation, translation"
-LARGEST_VEHICLE = 20.0
-"""Metres: no two sensors are further apart."""
-FEWEST_STEPS = 20
-"""Common steps below which nothing is worth estimating."""
 
 
 def open_log(path: Path | str, format_id: str | None = None) -> Log:
@@ -77,7 +73,7 @@ def calibrate_motions(
     progress.begin(STAGES, 3)
     names = tuple(motions)
     chains = [sync.chain(m) for m in motions.values()]
-    _check_overlap(names, chains, config.timing.max_offset)
+    checks.overlap(names, chains, config.timing.max_offset)
 
     clocks = clocks or names
     offsets = timing.estimate(chains, clocks, config.timing)
@@ -87,13 +83,13 @@ def calibrate_motions(
     progress.advance(STAGES, 1)
 
     steps = sync.synchronise(_on_base_clock(chains, offsets.dt), config.sync.gate)
-    _check_steps(steps)
-    _check_lengths(names, steps)
+    checks.steps(steps)
+    checks.lengths(names, steps)
     steps = sync.add_timing_noise(steps, offsets.cov)
 
     rotations = rotation.estimate(steps, config.rotation)
     unknown_turns = observability.unmeasured_turns(names, steps, rotations.R_base_sensor)
-    _check_turning(names, unknown_turns)
+    checks.turning(names, unknown_turns)
     unknown_turns += observability.vague_turns(names, rotations.cov, unknown_turns)
     progress.advance(STAGES, 1)
 
@@ -136,48 +132,3 @@ def _base_first(moved: Mapping[str, SensorMotion], base: str | None) -> list[str
 
 def _on_base_clock(chains: Sequence[sync.Chain], dt: Array) -> list[sync.Chain]:
     return [c.shifted(d) for c, d in zip(chains, dt, strict=True)]
-
-
-def _check_overlap(names: Sequence[str], chains: Sequence[sync.Chain], max_offset: float) -> None:
-    start, end = sync.common_span(chains)
-    if start < end + max_offset:
-        return
-    late = names[int(np.argmax([c.knots[0] for c in chains]))]
-    early = names[int(np.argmin([c.knots[-1] for c in chains]))]
-    raise DataError(
-        f"sensor {late} starts {start - end:.1f} s after sensor {early} ends, so they never recorded together; check "
-        "that both are of the same drive and that their clocks count from the same epoch, in seconds"
-    )
-
-
-def _check_steps(steps: sync.Steps) -> None:
-    if len(steps) >= FEWEST_STEPS:
-        return
-    raise NotObservableError(
-        f"the sensors share only {len(steps)} steps, too few to calibrate from ({steps.rejected} more were dropped "
-        "because their turns disagreed by many sigma); take a longer part of the drive, or check the sensors' clocks"
-    )
-
-
-def _check_lengths(names: Sequence[str], steps: sync.Steps) -> None:
-    """Refuse sensors that measure in different units: points of one vehicle go equally far, but for its turning."""
-    length = np.linalg.norm(steps.vec[..., :3], axis=-1).sum(axis=1)
-    noise = np.sqrt(np.trace(steps.cov[..., :3, :3], axis1=-2, axis2=-1)).sum(axis=1)
-    by_turning = LARGEST_VEHICLE * np.linalg.norm(steps.vec[0, :, 3:], axis=-1).sum()
-    for i, name in enumerate(names[1:], start=1):
-        apart = abs(length[i] - length[0]) - 4 * (noise[i] + noise[0]) - by_turning
-        if steps.has_scale[i] and length[i] > 0 and apart > 0.5 * min(length[i], length[0]):
-            raise DataError(
-                f"sensor {name} says it drove {length[i]:.4g} m where {names[0]} says {length[0]:.4g} m, so one of "
-                "them is not in metres; convert it, or state has_scale = false"
-            )
-
-
-def _check_turning(names: Sequence[str], unknown: Sequence[Undetermined]) -> None:
-    """Refuse a drive that says nothing about any sensor."""
-    open_directions = [key.split(".")[0] for u in unknown for key in list(u.direction)[:1]]
-    if all(open_directions.count(name) == 3 for name in names[1:]):
-        raise NotObservableError(
-            "the vehicle hardly turned in this part of the drive, so nothing can be told of how the sensors sit; "
-            "drive bends to both sides, and a ramp, kerbs or rough ground"
-        )
