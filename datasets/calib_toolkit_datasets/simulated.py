@@ -173,6 +173,7 @@ def _sensor(name: str, values: dict[str, Any]) -> SimulatedSensor:
 def _noise(stamps: Array, rng: np.random.Generator, hertz: float) -> Array:
     """Smooth noise of unit standard deviation with little above the given frequency."""
     smooth = gaussian_filter1d(rng.normal(size=len(stamps)), 1 / (2 * np.pi * hertz * GRID), mode="wrap")
+    smooth -= smooth.mean()
     return smooth / smooth.std()
 
 

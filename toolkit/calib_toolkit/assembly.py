@@ -18,6 +18,10 @@ SHARE = 0.3
 """A parameter is not determined if an undetermined direction has at least this component along it."""
 
 
+ANYTHING = {"x": 2.0, "y": 2.0, "z": 2.0, "rx": 1.0, "ry": 1.0, "rz": 1.0, "dt": 1.0}
+"""Sigma of what the drive says nothing about: metres, radians, seconds."""
+
+
 def determined(names: Sequence[str], undetermined: Sequence[Undetermined]) -> NDArray[np.bool_]:
     """(n, 7) whether each sensor's each parameter is determined."""
     known = np.ones((len(names), len(PARAMETERS)), dtype=bool)
@@ -39,7 +43,8 @@ def calibration(
 ) -> Calibration:
     """The calibration after as many stages as are given; what later ones will find is not determined yet.
 
-    The stages are estimated one after the other, so their covariances fill blocks of the joint one.
+    The stages are estimated one after the other, so their covariances fill blocks of the joint one. Along an
+    undetermined direction it holds ``ANYTHING``, which parameters that lean on it get their part of.
     """
     n = len(names)
     known = determined(names, undetermined)
@@ -56,13 +61,26 @@ def calibration(
     else:
         t = translations.t_base_sensor
         cov[:, :3, :, :3] = translations.cov.reshape(n, 3, n, 3)
+    joint: Array = cov.reshape(7 * n, 7 * n)
+    for u in undetermined:
+        spread = _vector(names, u)
+        joint = joint + np.outer(spread, spread)
     return Calibration(
         names[0],
         names,
         se3.rigid(R, t),
         offsets.dt,
-        cov.reshape(7 * n, 7 * n),
+        joint,
         has_scale,
         known,
         tuple(undetermined),
     )
+
+
+def _vector(names: Sequence[str], u: Undetermined) -> Array:
+    """(7n,) an undetermined direction, as long as what is not known along it."""
+    found = np.zeros((len(names), len(PARAMETERS)))
+    for key, component in u.direction.items():
+        name, _, parameter = key.rpartition(".")
+        found[names.index(name), PARAMETERS.index(parameter)] = component * ANYTHING[parameter]
+    return found.ravel()

@@ -121,8 +121,10 @@ def optimise(start: Array, chains: Sequence[Chain], groups: Array, grid: Grid, t
 
 def uncertainty(dt: Array, chains: Sequence[Chain], groups: Array, grid: Grid, trim: float) -> Array:
     """Covariance (q, q) of the clocks' offsets: the larger of Cramer-Rao and the approximate delta method (VI-D1)."""
-    angle, variance = angles(chains, grid.stamps, grid.window, _spread(dt, groups))
-    slope = np.gradient(angle, grid.stamps, axis=1)
+    full, nearby = _spread(dt, groups), grid.window / 8
+    angle, variance = angles(chains, grid.stamps, grid.window, full)
+    before, after = (angles(chains, grid.stamps + h, grid.window, full)[0] for h in (-nearby, nearby))
+    slope = (after - before) / (2 * nearby)
     to_clock = _to_clock(groups)
     sums = delta.Sums.zero(dt.size, len(chains), len(grid.stamps))
     for x, y in all_pairs(len(chains)):
