@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,11 @@ class _Slice:
     options: Any
     folder: Path | None
 
+    @property
+    def lazy(self) -> bool:
+        """Whether its readings still have to be loaded."""
+        return isinstance(self.stream.readings, LazyReadings)
+
 
 def estimate_motions(
     streams: Iterable[tuple[Stream, Sensor]],
@@ -58,16 +64,16 @@ def estimate_motions(
     work = {stream.name: _slices(stream, sensor, options, folder) for stream, sensor in streams}
     for name, slices in work.items():
         progress.begin(name, sum(len(s.stream) - 1 for s in slices))
-    done: dict[str, list[SensorMotion]] = {}
     pool = joblib.Parallel(n_jobs=jobs, return_as="generator", pre_dispatch="2*n_jobs")
-    for name, slices in work.items():
-        # what is in memory already costs more to send than to do here
-        lazy = jobs != 1 and isinstance(slices[0].stream.readings, LazyReadings)
-        results = pool(joblib.delayed(_estimate)(s) for s in slices) if lazy else map(_estimate, slices)
-        done[name] = []
-        for part, result in zip(slices, results, strict=True):
-            done[name].append(result)
-            progress.advance(name, len(part.stream) - 1)
+    parts = [(name, part) for name, slices in work.items() for part in slices]
+    # what is in memory already costs more to send than to do here
+    sent = [p for p in parts if jobs != 1 and p[1].lazy]
+    here = [p for p in parts if jobs == 1 or not p[1].lazy]
+    results = chain(map(_estimate, (part for _, part in here)), pool(joblib.delayed(_estimate)(p) for _, p in sent))
+    done: dict[str, list[SensorMotion]] = {name: [] for name in work}
+    for (name, part), result in zip([*here, *sent], results, strict=True):
+        done[name].append(result)
+        progress.advance(name, len(part.stream) - 1)
     return {name: _joined(name, work[name], parts) for name, parts in done.items()}
 
 
@@ -112,7 +118,7 @@ def _options(stream: Stream, sensor: Sensor, options: Mapping[str, Mapping[str, 
 def _estimate(part: _Slice) -> SensorMotion:
     """One slice: from the cache, or made and kept there."""
     stream, sensor = part.stream, part.sensor
-    if part.folder is None or not isinstance(stream.readings, LazyReadings):
+    if part.folder is None or not part.lazy:
         return _estimate_readable(stream, sensor, part.options)
     what = (stream.name, stream.stamps, stream.readings, stream.intrinsics, stream.has_scale)
     key = cache.key_of(sensor.id, sensor.version, part.options, *what)
@@ -167,7 +173,7 @@ def _joined(name: str, slices: list[_Slice], parts: list[SensorMotion]) -> Senso
         return SensorMotion(Trajectory.concatenate(trajectories), notes)
     steps = Motions.concatenate([p.motions for p in parts])
     failed = total - 1 - len(notes) - len(steps)
-    if failed > 0 and isinstance(slices[0].stream.readings, LazyReadings):
+    if failed > 0 and slices[0].lazy:
         notes += (
             f"sensor {name}: no motion could be estimated for {failed} of its {total - 1} steps; they are left out",
         )
