@@ -5,6 +5,7 @@ import inspect
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import Distribution, distributions
 from pathlib import Path
 from types import ModuleType
@@ -126,7 +127,7 @@ def _found(files: Iterable[Path]) -> Iterable[tuple[str, str, str, Callable[[], 
                 seen.add(key)
                 yield f"{point.value} of {_name(dist)}", _name(dist), dist.version, point.load
     for file in files:
-        yield str(file), FILE, "-", lambda file=file: _module_from(file)  # type: ignore[misc]
+        yield str(file), FILE, "-", partial(_module_from, file)
 
 
 def _name(dist: Distribution) -> str:
