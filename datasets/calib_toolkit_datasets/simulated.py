@@ -30,7 +30,7 @@ def calib_register_datasets() -> list[Dataset]:
 
 
 @dataclass(frozen=True)
-class Path6:
+class TruePath:
     """A true path. stamps: (m,) every ``GRID`` seconds; T_world_vehicle: (m, 4, 4)."""
 
     stamps: Array
@@ -72,7 +72,7 @@ class SimulatedSensor:
             raise ValueError(f"the sigma of {self.name} must be six positive numbers")
 
 
-def path(seconds: float, seed: int, drive: str = "street") -> Path6:
+def path(seconds: float, seed: int, drive: str = "street") -> TruePath:
     """The vehicle's path. drive: street (like KITTI drive 27), rough, planar, straight, turn or static.
 
     Turns, stops and speeds are drawn at random; roll, pitch and heave are those of a car on its suspension.
@@ -99,10 +99,10 @@ def path(seconds: float, seed: int, drive: str = "street") -> Path6:
     ahead = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))]) * speed[:, None]
     t = np.cumsum(ahead, axis=0) * GRID
     t[:, 2] += swing * still * _noise(stamps, rng, 0.2) * 0.02
-    return Path6(stamps, se3.rigid(R, t))
+    return TruePath(stamps, se3.rigid(R, t))
 
 
-def measure(true: Path6, sensor: SimulatedSensor, seed: int) -> Stream:
+def measure(true: TruePath, sensor: SimulatedSensor, seed: int) -> Stream:
     """What the sensor makes of the drive: stamped motions with noise, as an ``odometry`` stream."""
     rng = np.random.default_rng([seed, *sensor.name.encode()])
     first, last = true.stamps[0] + 2.0, true.stamps[-1] - 2.0

@@ -10,7 +10,7 @@ from calib_toolkit import se3
 from calib_toolkit.rotation import Rotations
 from calib_toolkit.sync import Steps
 from calib_toolkit.types import Motions
-from calib_toolkit_datasets.simulated import Path6, SimulatedSensor, measure
+from calib_toolkit_datasets.simulated import SimulatedSensor, TruePath, measure
 
 Array = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ LIDAR, INS, CAMERA = pose(0, 0, 1.7), pose(-0.8, 0.3, 0.9, 1, 2, 3), pose(0.3, 0
 MOUNTS = (LIDAR, INS, CAMERA, pose(1.2, -0.6, 0.5, 5, -4, 120), pose(0.2, 0.8, 1.1, -90, 0, 90), pose(-1, 0, 2))
 
 
-def motions_of(true: Path6, sensor: SimulatedSensor, seed: int) -> Motions:
+def motions_of(true: TruePath, sensor: SimulatedSensor, seed: int) -> Motions:
     """What the sensor measures of the drive, on its own stamps."""
     stream = measure(true, sensor, seed)
     readings = list(stream.readings)[1:]
@@ -36,12 +36,14 @@ def motions_of(true: Path6, sensor: SimulatedSensor, seed: int) -> Motions:
     return Motions(stream.stamps[:-1], stream.stamps[1:], vec, cov, stream.has_scale)
 
 
-def drive(true: Path6, sensors: Sequence[SimulatedSensor], seed: int) -> dict[str, Motions]:
+def drive(true: TruePath, sensors: Sequence[SimulatedSensor], seed: int) -> dict[str, Motions]:
     """Every sensor's motions, by name."""
     return {s.name: motions_of(true, s, seed) for s in sensors}
 
 
-def known_times(true: Path6, mounts: Sequence[Array], sigma: Array, seed: int, cameras: Sequence[int] = ()) -> Steps:
+def known_times(
+    true: TruePath, mounts: Sequence[Array], sigma: Array, seed: int, cameras: Sequence[int] = ()
+) -> Steps:
     """All sensors read at the same ten instants a second. mounts: (n, 4, 4) in the vehicle; sigma: (6,)."""
     rng = np.random.default_rng(seed)
     stamps = np.arange(true.stamps[0] + 2, true.stamps[-1] - 2, 0.1)
