@@ -50,6 +50,7 @@ def run(
     from calib_toolkit.result_file import write_result
 
     given = {name: value for name, value in chosen.items() if value is not None}
+    # click has seen to the types
     config = replace(read_config(config_file) if config_file else Config(), **given)  # type: ignore[arg-type]
     installed = registry(plugins)
     log = installed.open_log(drive, format_id).select(_names(sensors))
