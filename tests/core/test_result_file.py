@@ -144,7 +144,8 @@ def damaged(change):
         damaged(lambda d: d.update(sensors={})),
         damaged(lambda d: d.update(base="radar")),
         damaged(lambda d: d["sensors"].update(ins=3)),
-        damaged(lambda d: d["sensors"]["ins"].pop("sigma")),
+        damaged(lambda d: d["sensors"]["ins"].pop("T_base_sensor")),
+        damaged(lambda d: d["sensors"]["ins"]["sigma"].pop("dt")),
         damaged(lambda d: d["sensors"]["ins"].update(T_base_sensor=[[1, 2], [3, 4]])),
         damaged(lambda d: d["sensors"]["ins"].update(T_base_sensor="x")),
         damaged(lambda d: d["covariance"].update(matrix=[[1.0]])),
@@ -160,3 +161,15 @@ def test_what_is_not_a_calibration_is_refused_by_name(file, damage):
 def test_a_file_that_is_not_there_is_refused_by_name(tmp_path):
     with pytest.raises(DataError, match=r"none\.json"):
         read_calibration(tmp_path / "none.json")
+
+
+def test_poses_alone_are_a_calibration(tmp_path):
+    """A rig that someone measured: no sigma is exact, no offset is an offset not known."""
+    file = tmp_path / "truth.json"
+    pose = [[1, 0, 0, 0.5], [0, 1, 0, None], [0, 0, 1, 0.0], [0, 0, 0, 1]]
+    sensors = {"velo": {"T_base_sensor": np.eye(4).tolist(), "dt_base_sensor": 0.0}, "ins": {"T_base_sensor": pose}}
+    file.write_text(json.dumps({"base": "velo", "sensors": sensors}))
+    read = read_calibration(file)
+    assert read.determined.tolist() == [[True] * 7, [True, False, True, True, True, True, False]]
+    assert np.all(read.sigma[read.determined] == 0.0)
+    assert read.T_base_sensor[1, 0, 3] == 0.5

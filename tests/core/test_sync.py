@@ -89,13 +89,13 @@ def test_large_turns_are_interpolated_on_the_group():
 
 
 def test_a_street_is_interpolated_to_about_a_sensors_noise():
-    """Pitch on the suspension is faster than 10 Hz shows: 0.09 degrees and 3 mm are left; roll and yaw are not."""
+    """The suspension is in part faster than 10 Hz shows: 0.013 degrees of roll and 2 mm are left."""
     sensors = [SimulatedSensor("a", LIDAR, sigma=QUIET), SimulatedSensor("b", LIDAR, sigma=QUIET)]
     a, b = (motions_of(path(30, 1), s, 1) for s in sensors)
     assert abs((b.start[0] - a.start[0]) % 0.1 - 0.05) < 0.045  # not read at the same instants
     steps = synchronise(a, b, gate=np.inf)
     error = (steps.vec[1] - steps.vec[0])[5:-5]
-    assert np.all(np.std(error[:, 3:], axis=0) < np.radians([0.015, 0.12, 0.003]))
+    assert np.all(np.std(error[:, 3:], axis=0) < np.radians([0.02, 0.015, 0.005]))
     assert np.all(np.std(error[:, :3], axis=0) < 0.004)
 
 

@@ -312,7 +312,7 @@ def test_cameras_only_have_rotation_and_time_but_no_translation(run, drive, writ
     T = np.array(cam1["T_base_sensor"], dtype=float)
     truth = Rotation.from_euler("ZYX", [[-90, 0, -90], [-120, 0, -90]], degrees=True)
     error = (truth[0].inv() * truth[1]).inv() * Rotation.from_matrix(T[:3, :3])
-    assert np.degrees(error.magnitude()) < 1.0
+    assert np.degrees(error.magnitude()) < 1.5
     assert abs(cam1["dt_base_sensor"]) < 0.01
     assert np.isnan(T[:3, 3]).all()
     assert [cam1["sigma"][k] for k in "xyz"] == [None] * 3

@@ -8,6 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from calib_toolkit.cli.bars import bars as bars
     from calib_toolkit.config import Config as Config
     from calib_toolkit.errors import CalibrationError as CalibrationError
     from calib_toolkit.errors import DataError as DataError
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from calib_toolkit.pipeline import calibrate as calibrate
     from calib_toolkit.pipeline import calibrate_motions as calibrate_motions
     from calib_toolkit.pipeline import open_log as open_log
+    from calib_toolkit.result_file import read_calibration as read_calibration
+    from calib_toolkit.result_file import write_calibration as write_calibration
     from calib_toolkit.types import Calibration as Calibration
     from calib_toolkit.types import CameraIntrinsics as CameraIntrinsics
     from calib_toolkit.types import Fix as Fix
@@ -39,6 +42,7 @@ if TYPE_CHECKING:
     from calib_toolkit.types import Transform as Transform
 
 _HOMES = {
+    "calib_toolkit.cli.bars": ["bars"],
     "calib_toolkit.config": ["Config"],
     "calib_toolkit.errors": ["CalibrationError", "DataError"],
     "calib_toolkit.hookspecs": [
@@ -54,6 +58,7 @@ _HOMES = {
         ),
     ],
     "calib_toolkit.pipeline": ["calibrate", "calibrate_motions", "open_log"],
+    "calib_toolkit.result_file": ["read_calibration", "write_calibration"],
     "calib_toolkit.types": [
         *(
             "Calibration",

@@ -1,7 +1,7 @@
 """From a recorded drive to a calibrated rig: the paper's section IV, stage by stage."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from calib_toolkit.errors import ConfigError, DataError
 from calib_toolkit.estimation import SensorMotion, estimate_motions
 from calib_toolkit.plugins import Registry, registry
 from calib_toolkit.progress import Progress, Silent
+from calib_toolkit.result_file import read_calibration
 from calib_toolkit.types import Log, Motions, Result
 
 Array = NDArray[np.float64]
@@ -20,9 +21,18 @@ Array = NDArray[np.float64]
 STAGES = "timing, rotation, translation"
 
 
-def open_log(path: Path | str, format_id: str | None = None) -> Log:
-    """The recording at a path, by the reader named or the one that recognises it. Raises DataError."""
-    return registry().open_log(Path(path), format_id)
+TRUTH = "truth.json"
+"""A calibration that may lie in a recording's folder, to compare with."""
+
+
+def open_log(path: Path | str, format_id: str | None = None, plugins: Registry | None = None) -> Log:
+    """The recording at a path, by the reader named or the one that recognises it. Raises DataError.
+
+    A ``truth.json`` in its folder, in the schema of calibration.json, becomes the log's reference.
+    """
+    log = (plugins or registry()).open_log(Path(path), format_id)
+    truth = Path(path) / TRUTH
+    return replace(log, reference=read_calibration(truth)) if truth.is_file() else log
 
 
 def calibrate(

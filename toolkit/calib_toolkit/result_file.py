@@ -21,9 +21,12 @@ CONVENTION = (
 
 def write_result(result: Result, file: Path) -> None:
     """Write a result as JSON, whole or not at all."""
-    part = file.with_suffix(".part")
-    part.write_text(json.dumps(result_dict(result), indent=1, allow_nan=False) + "\n")
-    part.replace(file)
+    _write(result_dict(result), file)
+
+
+def write_calibration(calibration: Calibration, file: Path) -> None:
+    """Write one calibration alone (a truth, a measured rig) as JSON, whole or not at all."""
+    _write({"convention": CONVENTION, **calibration_dict(calibration)}, file)
 
 
 def result_dict(result: Result) -> dict[str, Any]:
@@ -65,35 +68,50 @@ def calibration_dict(c: Calibration) -> dict[str, Any]:
 
 
 def read_calibration(file: Path) -> Calibration:
-    """The best calibration of a file that :func:`write_result` wrote. Raises DataError."""
+    """The best calibration of a file in the schema of :func:`write_result`. Raises DataError.
+
+    ``base`` and each sensor's ``T_base_sensor`` must be there. Without sigma and covariance the values are taken
+    as exact, except those that are null or missing, which are then not determined.
+    """
     try:
         return _calibration(json.loads(file.read_text()))
     except (OSError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as e:
-        raise DataError(f"{file} is not a calibration this program wrote ({type(e).__name__}: {e})") from e
+        raise DataError(f"{file} is not a calibration this program can read ({type(e).__name__}: {e})") from e
 
 
 def _calibration(d: dict[str, Any]) -> Calibration:
     names, sensors = tuple(d["sensors"]), list(d["sensors"].values())
     n, order = len(names), [f"{name}.{p}" for name in d["sensors"] for p in PARAMETERS]
-    sigma = np.array([[s["sigma"][p] for p in PARAMETERS] for s in sensors], dtype=float)
     poses = np.array([s["T_base_sensor"] for s in sensors], dtype=float)
-    cov = np.array(d["covariance"]["matrix"], dtype=float)
-    if d["base"] not in names or d["covariance"]["order"] != order:
+    dt = np.array([s.get("dt_base_sensor") for s in sensors], dtype=float)
+    covariance = d.get("covariance") or {"order": order, "matrix": np.zeros((7 * n, 7 * n))}
+    cov = np.array(covariance["matrix"], dtype=float)
+    if d["base"] not in names or covariance["order"] != order:
         raise ValueError("its base or the order of its covariance does not fit its sensors")
     if poses.shape != (n, 4, 4) or cov.shape != (7 * n, 7 * n):
         raise ValueError(f"poses of shape {poses.shape} and a covariance of shape {cov.shape} for {n} sensors")
+    turned = np.broadcast_to(np.isfinite(poses[:, :3, :3]).all(axis=(1, 2))[:, None], (n, 3))
+    known = np.column_stack([np.isfinite(poses[:, :3, 3]), turned, np.isfinite(dt)])
+    sigma = [[s["sigma"][p] for p in PARAMETERS] if "sigma" in s else [0.0] * 7 for s in sensors]
+    known &= np.isfinite(np.array(sigma, dtype=float))
     return Calibration(
         d["base"],
         names,
         poses,
-        np.nan_to_num(np.array([s["dt_base_sensor"] for s in sensors], dtype=float)),
+        np.nan_to_num(dt),
         np.nan_to_num(cov),
-        np.array([s["has_scale"] for s in sensors], dtype=bool),
-        np.isfinite(sigma),
-        tuple(Undetermined(dict(u["direction"]), str(u["sentence"])) for u in d["undetermined"]),
-        np.array([s["clock_skew"] for s in sensors], dtype=float),
-        float(sensors[0]["t_ref"]),
+        np.array([s.get("has_scale", True) for s in sensors], dtype=bool),
+        known,
+        tuple(Undetermined(dict(u["direction"]), str(u["sentence"])) for u in d.get("undetermined", [])),
+        np.array([s.get("clock_skew", 0.0) for s in sensors], dtype=float),
+        float(sensors[0].get("t_ref", 0.0)),
     )
+
+
+def _write(content: dict[str, Any], file: Path) -> None:
+    part = file.with_suffix(".part")
+    part.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+    part.replace(file)
 
 
 def _plain(a: Any) -> Any:

@@ -5,11 +5,12 @@ is wrong or not determined; 130 interrupted.
 """
 
 from importlib import import_module
+from importlib.metadata import entry_points
 from typing import Any
 
 import click
 
-from calib_toolkit.errors import CalibrationError
+from calib_toolkit.errors import CalibrationError, PluginError
 
 COMMANDS = {
     "run": "Calibrate the sensors of a drive.",
@@ -18,26 +19,46 @@ COMMANDS = {
     "demo": "Calibrate a simulated drive and show truth beside estimate.",
 }
 """Name of each command, which is its module here and the function in it, and what it does in one line."""
+PLUGINS = "calib_toolkit.commands"
+"""Entry points under which plugins add commands: a name, and a click command that imports nothing heavy."""
 
 
 class LazyGroup(click.Group):
     """A group that imports a command only to run it, and turns every error into one line on stderr."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """The names, in the order in which one meets them."""
-        return list(COMMANDS)
+        """The toolkit's own, in the order in which one meets them, then those that plugins add."""
+        return [*COMMANDS, *sorted(entry_points(group=PLUGINS).names - COMMANDS.keys())]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """The command of that name, imported now, or None if there is none."""
-        if cmd_name not in COMMANDS:
-            return None
-        command: click.Command = getattr(import_module(f"calib_toolkit.cli.{cmd_name}"), cmd_name)
-        return command
+        """The command of that name, imported now, or None if there is none. Raises PluginError."""
+        if cmd_name in COMMANDS:
+            command: click.Command = getattr(import_module(f"calib_toolkit.cli.{cmd_name}"), cmd_name)
+            return command
+        for point in entry_points(group=PLUGINS, name=cmd_name):
+            try:
+                added: click.Command = point.load()
+                return added
+            except Exception as e:
+                raise PluginError(
+                    f"the command '{cmd_name}' ({point.value}) could not be loaded ({type(e).__name__}: {e}); mend or "
+                    "uninstall its plugin"
+                ) from e
+        return None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """The list of commands in ``--help``, without importing any."""
+        """The list of commands in ``--help``, importing only those of plugins."""
         with formatter.section("Commands"):
-            formatter.write_dl(list(COMMANDS.items()))
+            formatter.write_dl([(name, self._help(ctx, name)) for name in self.list_commands(ctx)])
+
+    def _help(self, ctx: click.Context, name: str) -> str:
+        if name in COMMANDS:
+            return COMMANDS[name]
+        try:
+            command = self.get_command(ctx, name)
+        except PluginError:
+            return "(its plugin can not be loaded)"
+        return command.get_short_help_str(100) if command else ""
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command. A refusal exits with 1, an interrupt with 130; ``--debug`` lets tracebacks through."""

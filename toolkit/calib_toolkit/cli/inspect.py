@@ -23,9 +23,10 @@ def inspect(ctx: click.Context, drive: Path, format_id: str | None, plugins: tup
     from rich.table import Table
 
     from calib_toolkit.inspection import inspect_log
+    from calib_toolkit.pipeline import open_log
     from calib_toolkit.plugins import registry
 
-    log = registry(plugins).open_log(drive, format_id)
+    log = open_log(drive, format_id, registry(plugins))
     seen = inspect_log(log)
     console = Console(highlight=False)
     console.print(f"{seen.source}: {seen.duration:.1f} s{_date(log.epoch_ns)}", markup=False, soft_wrap=True)

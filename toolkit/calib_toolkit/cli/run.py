@@ -45,7 +45,7 @@ def run(
     from calib_toolkit.cli.bars import bars
     from calib_toolkit.cli.tables import show_result
     from calib_toolkit.config import Config, read_config
-    from calib_toolkit.pipeline import calibrate
+    from calib_toolkit.pipeline import calibrate, open_log
     from calib_toolkit.plugins import registry
     from calib_toolkit.result_file import write_result
 
@@ -53,7 +53,7 @@ def run(
     # click has seen to the types
     config = replace(read_config(config_file) if config_file else Config(), **given)  # type: ignore[arg-type]
     installed = registry(plugins)
-    log = installed.open_log(drive, format_id).select(_names(sensors))
+    log = open_log(drive, format_id, installed).select(_names(sensors))
     file = _writable(out) if out else None
     with bars() as progress:
         result = calibrate(log, config, installed, progress)
