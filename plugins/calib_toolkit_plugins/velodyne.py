@@ -1,6 +1,7 @@
 """Spinning lidar: motion by registration of successive sweeps (paper, section V-A)."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ Array = NDArray[np.float64]
 KEYS = ("scans", "times", "turns")
 TURNS = {"clockwise": -1.0, "counterclockwise": 1.0}
 SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
+COARSER = 2.0
+"""How many times larger the cells of the first pass are."""
 
 
 @dataclass(frozen=True)
@@ -30,10 +33,8 @@ class VelodyneOptions:
     range_sigma: noise along the beam from which the covariance follows (the paper's 0.1 m).
     max_jump: how far a step may be from the one before it; also the sigma of what the surroundings do not show.
     min_overlap: share of a sweep that must lie on the surfaces of the sweep before. min_points: with fewer left
-    of it, a sweep is not used. deskew: move points to where the scanner was at the stamp. smoothing: weight of
-    all earlier motions beside the previous one in doing so; 0 is the paper's, but one step's roll and pitch say
-    little of the next. point_to_plane: answer with the paper's point-to-plane minimum instead of the
-    plane-to-plane one, which is the more accurate.
+    of it, a sweep is not used. deskew: move points to where the scanner was at the stamp. point_to_plane: answer
+    with the paper's point-to-plane minimum instead of the plane-to-plane one, which is the more accurate.
     """
 
     min_range: float = 2.0
@@ -45,42 +46,29 @@ class VelodyneOptions:
     min_overlap: float = 0.5
     min_points: int = 200
     deskew: bool = True
-    smoothing: float = 0.5
     point_to_plane: bool = False
 
 
 @hookimpl
 def calib_register_sensors() -> list[Sensor]:
     """The ``velodyne`` sensor."""
-    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="1")]
+    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="3")]
 
 
 def estimate(stream: Stream, options: VelodyneOptions) -> Motions:
     """``T_prev_curr`` between the stamps of successive ``Scan`` readings, with the covariance of range noise.
 
-    The previous motion is the first guess, and moves the points of a sweep to its stamp. A step that fails (too
-    few points, too little overlap, a jump) is left out, and the one after it starts from nothing again.
+    Two passes. In the first, a coarse one, the previous motion is the first guess and moves the points of a sweep
+    to its stamp, as in the paper; but roll and pitch change within a sweep, so the second moves them by the mean of
+    the motions before and after. A step that fails (too few points, too little overlap, a jump) is left out.
     Raises DataError with fewer than two readings, or one that is not a scan.
     """
     if len(stream) < 2:
         raise DataError(f"sensor {stream.name}: a motion takes two scans, and there are {len(stream)}")
-    steps = []
-    prev, velocity, steady = _Sweep.read(stream, 0, options), None, None
-    for k in range(1, len(stream)):
-        curr, dt = _Sweep.read(stream, k, options), float(stream.stamps[k] - stream.stamps[k - 1])
-        step = _step(prev, curr, dt, velocity, steady, options)
-        if step is None:
-            prev, velocity, steady = curr, None, None
-        else:
-            T_prev_curr, cov, prev = step
-            vec = se3.vector(T_prev_curr)
-            velocity = vec / dt
-            steady = velocity if steady is None else options.smoothing * steady + (1 - options.smoothing) * velocity
-            steps.append((stream.stamps[k - 1], stream.stamps[k], vec, cov))
-    if not steps:
-        return Motions(np.zeros(0), np.zeros(0), np.zeros((0, 6)), np.zeros((0, 6, 6)))
-    start, end, vec, cov = (np.array(column) for column in zip(*steps, strict=True))
-    return Motions(start, end, vec, cov)
+    if not options.deskew or getattr(stream.readings[0], "times", None) is None:
+        return _motions(stream, _first_pass(stream, options))
+    first = _first_pass(stream, replace(options, cell=COARSER * options.cell))
+    return _motions(stream, _second_pass(stream, options, first))
 
 
 def deskew(points: Array, times: Array, velocity: Array) -> Array:
@@ -96,12 +84,11 @@ def deskew(points: Array, times: Array, velocity: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Sweep:
-    """The usable points of a scan as measured, or moved by a velocity once its surface is made."""
+    """The usable points of a scan, each as measured."""
 
     points: Array
     times: Array | None
     options: VelodyneOptions
-    made: Surface | None = None
 
     @staticmethod
     def read(stream: Stream, k: int, options: VelodyneOptions) -> "_Sweep":
@@ -125,43 +112,78 @@ class _Sweep:
         return len(self.points) >= self.options.min_points
 
     def surface(self, velocity: Array | None) -> Surface:
-        """Made once, and then the same for both steps that the sweep is part of."""
-        if self.made is not None:
-            return self.made
+        """What it saw, its points moved by a velocity (6,) to the stamp."""
         if velocity is None or self.times is None:
             return registration.surface(self.points, self.options.cell)
         return registration.surface(deskew(self.points, self.times, velocity), self.options.cell)
 
-    def keeping(self, made: Surface) -> "_Sweep":
-        return _Sweep(self.points, self.times, self.options, made)
+
+_Step = tuple[Array, Array] | None
+"""``T_prev_curr`` and its covariance; None where it failed."""
 
 
-def _step(
-    prev: _Sweep, curr: _Sweep, dt: float, velocity: Array | None, steady: Array | None, options: VelodyneOptions
-) -> tuple[Array, Array, _Sweep] | None:
-    """``T_prev_curr``, its covariance, and the current sweep with its surface; None where it fails.
+def _first_pass(stream: Stream, options: VelodyneOptions) -> list[_Step]:
+    """Every step from the motion before it; from nothing at the start and after a step that failed."""
+    steps: list[_Step] = []
+    prev, made, velocity = _Sweep.read(stream, 0, options), None, None
+    for k in range(1, len(stream)):
+        curr, dt = _Sweep.read(stream, k, options), float(stream.stamps[k] - stream.stamps[k - 1])
+        seed = None if velocity is None else se3.matrix(velocity * dt)
+        if seed is None and prev.enough and curr.enough:
+            seed = registration.register(
+                prev.surface(None), curr.surface(None), np.eye(4), registration.FAR_LEVELS, options.gate
+            )
+            velocity, made = se3.vector(seed) / dt, None
+        step = None
+        if prev.enough and curr.enough and seed is not None:
+            made, before = curr.surface(velocity), made if made is not None else prev.surface(velocity)
+            step = _step(before, made, seed, options)
+        velocity = None if step is None else se3.vector(step[0]) / dt
+        steps.append(step)
+        prev = curr
+    return steps
 
-    velocity foresees the motion, steady moves the points; None at the start.
-    """
-    if not (prev.enough and curr.enough):
-        return None
-    if velocity is None:
-        a, b = prev.surface(None), curr.surface(None)
-        T_first = registration.register(a, b, np.eye(4), registration.FAR_LEVELS, options.gate)
-        predicted, T_seed, steady = None, T_first, se3.vector(T_first) / dt
-    else:
-        predicted = T_seed = se3.matrix(velocity * dt)
-    a, b = prev.surface(steady), curr.surface(steady)
-    T = registration.register(a, b, T_seed, registration.NEAR_LEVELS, options.gate)
+
+def _second_pass(stream: Stream, options: VelodyneOptions, first: list[_Step]) -> list[_Step]:
+    """The steps of the first pass once more, each sweep moved by the mean velocity of the steps around it."""
+    dt = np.diff(stream.stamps)
+    velocity = [None if s is None else se3.vector(s[0]) / t for s, t in zip(first, dt, strict=True)]
+    steps: list[_Step] = []
+    made: tuple[int, Surface] | None = None
+    for k, seen in enumerate(first):
+        if seen is None:
+            steps.append(None)
+            continue
+        before, after = (_mean(velocity[max(i - 1, 0) : i + 1]) for i in (k, k + 1))
+        a = made[1] if made is not None and made[0] == k else _Sweep.read(stream, k, options).surface(before)
+        made = (k + 1, _Sweep.read(stream, k + 1, options).surface(after))
+        steps.append(_step(a, made[1], seen[0], options))
+    return steps
+
+
+def _mean(velocities: Sequence[Array | None]) -> Array:
+    return np.mean([v for v in velocities if v is not None], axis=0)
+
+
+def _step(prev: Surface, curr: Surface, T_seed: Array, options: VelodyneOptions) -> _Step:
+    T = registration.register(prev, curr, T_seed, registration.NEAR_LEVELS, options.gate)
     if options.point_to_plane:
-        T = registration.point_to_plane(a, b, T, options.gate)
-    if predicted is not None and np.linalg.norm(T[:3, 3] - predicted[:3, 3]) > options.max_jump:
+        T = registration.point_to_plane(prev, curr, T, options.gate)
+    if np.linalg.norm(T[:3, 3] - T_seed[:3, 3]) > options.max_jump:
         return None
-    residuals = registration.plane_residuals(a, b, T, options.gate)
+    residuals = registration.plane_residuals(prev, curr, T, options.gate)
     if residuals.overlap < options.min_overlap or len(residuals.errors) < options.min_points:
         return None
     cov = registration.range_covariance(residuals, options.range_sigma, options.max_jump)
-    return (T, cov, curr.keeping(b)) if np.all(np.isfinite(T)) and np.all(np.isfinite(cov)) else None
+    return (T, cov) if np.all(np.isfinite(T)) and np.all(np.isfinite(cov)) else None
+
+
+def _motions(stream: Stream, steps: Sequence[_Step]) -> Motions:
+    found = [(k, *step) for k, step in enumerate(steps) if step is not None]
+    if not found:
+        return Motions(np.zeros(0), np.zeros(0), np.zeros((0, 6)), np.zeros((0, 6, 6)))
+    k, T, cov = (np.array(column) for column in zip(*found, strict=True))
+    return Motions(stream.stamps[k], stream.stamps[k + 1], se3.vector(T), cov)
 
 
 def open_table(table: SensorTable) -> Log:
