@@ -196,3 +196,40 @@ def test_plugins_refuses_what_is_broken(run, tmp_path):
     result = run("plugins", "--plugin", tmp_path / "broken.py")
     assert result.exit_code == 1
     assert "a hook that does not exist, calib_register_radars" in result.stderr
+
+
+@pytest.fixture
+def added(monkeypatch):
+    """Adds a plugin's command ``extra``, or one that can not be loaded."""
+
+    def add(load):
+        class Point:
+            name, value = "extra", "their.module:extra"
+
+            def load(self):
+                return load()
+
+        class Points(list):
+            names = frozenset({"extra"})
+
+        monkeypatch.setattr(cli, "entry_points", lambda group, name=None: Points([Point()]))
+
+    return add
+
+
+def test_a_plugin_adds_a_command(run, added):
+    added(lambda: click.Command("extra", callback=lambda: click.echo("done"), help="Do more."))
+    assert "extra" in run("--help").output
+    assert "Do more." in run("--help").output
+    assert run("extra").output == "done\n"
+
+
+def test_a_plugins_command_that_can_not_be_loaded_is_refused_and_harms_no_other(run, added):
+    def fail():
+        raise ImportError("no module called 'their'")
+
+    added(fail)
+    assert run("--help").exit_code == 0
+    result = run("extra")
+    assert result.exit_code == 1
+    assert "'extra' (their.module:extra) could not be loaded (ImportError: no module called 'their')" in result.output

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from calib_toolkit.pipeline import calibrate as calibrate
     from calib_toolkit.pipeline import calibrate_motions as calibrate_motions
     from calib_toolkit.pipeline import open_log as open_log
+    from calib_toolkit.progress import Progress as Progress
     from calib_toolkit.result_file import read_calibration as read_calibration
     from calib_toolkit.result_file import write_calibration as write_calibration
     from calib_toolkit.types import Calibration as Calibration
@@ -58,6 +59,7 @@ _HOMES = {
         ),
     ],
     "calib_toolkit.pipeline": ["calibrate", "calibrate_motions", "open_log"],
+    "calib_toolkit.progress": ["Progress"],
     "calib_toolkit.result_file": ["read_calibration", "write_calibration"],
     "calib_toolkit.types": [
         *(

@@ -1,6 +1,6 @@
 """What a ray meets: the interface between the scene, which is cast, and the sensors, which look at it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Protocol
 
 import numpy as np
@@ -33,6 +33,9 @@ class Hits:
     normal_world: Floats
     material: NDArray[np.uint8]
     tone: Floats
+
+    def __getitem__(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> "Hits":
+        return Hits(*(getattr(self, f.name)[chosen] for f in fields(self)))
 
 
 class Scene(Protocol):

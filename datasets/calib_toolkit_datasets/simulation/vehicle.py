@@ -24,7 +24,8 @@ GRID = 0.005
 MARGIN = 2.0
 """Seconds of path before the drive begins and after it ends."""
 DRIVES = ("street", "rough", "court", "highway", "planar", "straight", "turn", "static")
-LONGEST = 7200.0
+SHORTEST, LONGEST = 60.0, 7200.0
+"""Seconds: of the path that is drawn at least, and of the longest drive."""
 
 ROLL: Bands = ((0.2, 0.5, 0.73), (0.5, 1, 0.74), (1, 2, 0.81), (2, 3, 0.48), (3, 5, 0.29), (5, 10, 0.17))
 PITCH: Bands = ((0.2, 0.5, 0.46), (0.5, 1, 0.85), (1, 2, 1.54), (2, 3, 0.53), (3, 5, 0.17), (5, 10, 0.11))
@@ -69,7 +70,8 @@ def path(seconds: float, seed: int, drive: str = "street") -> TruePath:
     if not 1.0 <= seconds <= LONGEST:
         raise ValueError(f"a drive takes from 1 to {LONGEST:g} s")
     rng = np.random.default_rng(seed)
-    stamps = np.arange(-MARGIN, seconds + MARGIN, GRID)
+    # slow changes need room: a short drive is the beginning of a longer one
+    stamps = np.arange(-MARGIN, max(seconds, SHORTEST) + MARGIN, GRID)
     speed, yaw_rate = _course(stamps, rng, drive)
     yaw = np.cumsum(yaw_rate) * GRID
     ahead = np.column_stack([np.cos(yaw), np.sin(yaw)])
@@ -84,7 +86,9 @@ def path(seconds: float, seed: int, drive: str = "street") -> TruePath:
     pitch = np.radians(_swing(stamps, rng, pitch_bands))
     R_ground_body = Rotation.from_euler("YX", np.column_stack([bumps * pitch, bumps * roll])).as_matrix()
     z = ground.height(xy) + bumps * _swing(stamps, rng, HEAVE)
-    return TruePath(stamps, se3.rigid(R_world_ground @ R_ground_body, np.column_stack([xy, z])))
+    T_world_vehicle = se3.rigid(R_world_ground @ R_ground_body, np.column_stack([xy, z]))
+    kept = stamps < seconds + MARGIN
+    return TruePath(stamps[kept], T_world_vehicle[kept])
 
 
 def _course(stamps: Array, rng: np.random.Generator, drive: str) -> tuple[Array, Array]:

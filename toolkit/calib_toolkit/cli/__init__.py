@@ -15,6 +15,7 @@ from calib_toolkit.errors import CalibrationError, PluginError
 COMMANDS = {
     "run": "Calibrate the sensors of a drive.",
     "inspect": "Show what a recording holds and what is wrong with it.",
+    "evaluate": "Repeat the paper's experiments on drives whose truth is known.",
     "plugins": "List what is installed, and where from.",
     "demo": "Calibrate a simulated drive and show truth beside estimate.",
 }
@@ -41,8 +42,8 @@ class LazyGroup(click.Group):
                 return added
             except Exception as e:
                 raise PluginError(
-                    f"the command '{cmd_name}' ({point.value}) could not be loaded ({type(e).__name__}: {e}); mend or "
-                    "uninstall its plugin"
+                    f"the command '{cmd_name}' ({point.value}) could not be loaded ({type(e).__name__}: {e}); mend "
+                    "or uninstall its plugin"
                 ) from e
         return None
 
