@@ -1,0 +1,617 @@
+"""The parts of the experiments: sections, errors, baselines, the table on disk, its statistics and its figures."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from builders import CAMERA, INS, LIDAR, MOUNTS, QUIET, drive, exact_turns, in_base, known_times, pose
+from scipy.spatial.transform import Rotation
+
+from calib_toolkit import CameraIntrinsics, Config, Log, Stream, se3
+from calib_toolkit.errors import CalibrationError, ConfigError, DataError, NotObservableError
+from calib_toolkit.evaluation import baselines, drives, experiment, figures, panorama, summary
+from calib_toolkit.evaluation.errors import euler_sigma, rotation_error, rotation_sigma
+from calib_toolkit.evaluation.measures import FORWARD_LEFT_UP, measure_pair, measure_panoramic, measure_timing
+from calib_toolkit.evaluation.paper import beside
+from calib_toolkit.evaluation.protocols import PROTOCOLS, protocol
+from calib_toolkit.evaluation.sections import Draw, cut, plan
+from calib_toolkit.evaluation.store import Store
+from calib_toolkit.progress import Silent
+from calib_toolkit.timing import TimingOptions
+from calib_toolkit.types import Calibration
+from calib_toolkit_datasets.simulated import SimulatedSensor, measure, path, truth
+
+FAST = Config(jobs=1, timing=TimingOptions(steps=1000))
+SIGMA = (0.004, 0.004, 0.004, 2e-4, 2e-4, 2e-4)
+SIDEWAYS, BACK = pose(0.2, 0.8, 1.1, -90, 0, -20), pose(0.1, -0.4, 1.2, -88, 1, 60)
+
+
+def a_drive(sensors, seconds=60.0, seed=3, name="rough", clocks=None):
+    """A simulated recording as the experiments see it."""
+    true = path(seconds, seed, "rough")
+    log = Log(None, {s.name: measure(true, s, seed) for s in sensors})
+    names = tuple(s.name for s in sensors)
+    return drives.Drive(name, log, drive(true, sensors, seed), clocks or names, truth(sensors))
+
+
+def sensor(name, mount, **values):
+    """One with a little noise."""
+    return SimulatedSensor(name, mount, **{"sigma": SIGMA, **values})
+
+
+@pytest.fixture(scope="module")
+def two():
+    return a_drive([sensor("velo", LIDAR), sensor("ins", INS, dt=0.03, rate=20.0)])
+
+
+@pytest.fixture(scope="module")
+def ring():
+    cameras = {"cam0": CAMERA, "cam1": SIDEWAYS, "cam2": BACK}
+    return a_drive([sensor(n, T, dt=0.01 * k, has_scale=False) for k, (n, T) in enumerate(cameras.items())])
+
+
+# ---- sections
+
+
+def test_drives_take_turns_and_short_ones_are_said_to_be(two, ring):
+    short = a_drive([sensor("velo", LIDAR), sensor("ins", INS)], seconds=15.0, name="short")
+    draws, skipped = plan([two, short], (10.0, 30.0, 90.0), (0.1, 1.0), 3)
+    assert [d.drive for d in draws if d.seconds == 10.0] == [0, 1, 0] * 2
+    assert [d.drive for d in draws if d.seconds == 30.0] == [0] * 6
+    assert [d.seconds for d in draws].count(90.0) == 0
+    assert [d.spread for d in draws][:6] == [0.1] * 3 + [1.0] * 3
+    assert len(skipped) == 2
+    assert skipped[0].startswith("30 s: longer than short (")
+    assert skipped[1].startswith("90 s: longer than rough, short (")
+
+
+def test_a_section_lies_in_the_drive_and_is_told_by_the_seed_alone(two):
+    draws, _ = plan([two], (20.0,), (0.0,), 40)
+    cuts = [cut(d, [two], "pair", 5) for d in draws]
+    starts = np.array([c.start for c in cuts])
+    first, last = two.span
+    assert starts.min() >= 0
+    assert starts.max() <= last - first - 20
+    assert np.ptp(starts) > 0.8 * (last - first - 20)  # over the whole drive
+    for c in cuts:
+        for m in c.motions.values():
+            assert m.start[0] >= first + c.start
+            assert first + c.start + 20 >= m.end[-1] > first + c.start + 19.7
+    again = cut(Draw(0, 20.0, 0.0, 7), [two], "pair", 5)
+    assert again.start == cuts[7].start
+    others = [cut(Draw(0, 20.0, 0.0, 7), [two], "pair", 6), cut(Draw(0, 20.0, 0.0, 7), [two], "timing", 5)]
+    others.append(cut(Draw(0, 20.0, 0.0, 8), [two], "pair", 5))
+    assert again.start not in [o.start for o in others]
+
+
+def test_clocks_are_moved_and_the_truth_with_them(two):
+    still, near, far = (cut(Draw(0, 20.0, spread, 3), [two], "timing", 0) for spread in (0.0, 0.1, 1.0))
+    assert near.start == far.start
+    shift = [c.motions["ins"].start[0] - still.motions["ins"].start[0] for c in (near, far)]
+    applied = [two.truth.dt_base_sensor[1] - c.truth.dt_base_sensor[1] for c in (near, far)]
+    assert applied[1] == pytest.approx(10 * applied[0])
+    assert 0 < abs(applied[0]) <= 0.1
+    assert shift == pytest.approx(applied)
+    # the base stays where it is
+    assert near.truth.dt_base_sensor[0] == 0
+    kept = two.motions["velo"].start
+    assert np.isin(near.motions["velo"].start, kept).all()
+
+
+def test_a_skewed_clock_is_as_late_as_in_the_middle_of_the_section(two):
+    skewed = replace(two, truth=replace(two.truth, clock_skew=np.array([0.0, 1e-3]), t_ref=10.0))
+    c = cut(Draw(0, 20.0, 0.0, 0), [skewed], "pair", 0)
+    middle = skewed.span[0] + c.start + 10.0
+    assert c.truth.dt_base_sensor[1] == pytest.approx(0.03 + 1e-3 * (middle - 10.0))
+
+
+# ---- drives and their truth
+
+
+def test_the_truth_is_seen_from_the_base(two):
+    sensors = [sensor(f"s{k}", T, dt=0.1 * k) for k, T in enumerate(MOUNTS)]
+    seen = drives.rebased(truth(sensors), ("s2", "s4", "s0"), "a drive")
+    assert (seen.base, seen.names) == ("s2", ("s2", "s4", "s0"))
+    np.testing.assert_allclose(seen.T_base_sensor, in_base([MOUNTS[2], MOUNTS[4], MOUNTS[0]]), atol=1e-12)
+    np.testing.assert_allclose(seen.dt_base_sensor, [0, 0.2, -0.2], atol=1e-12)
+    assert seen.determined.all()
+
+
+@pytest.mark.parametrize(
+    ("unknown", "lost"),
+    [
+        (("s0", slice(0, 3)), {"s0": "t", "s1": "t", "s2": "t"}),  # where the base sits
+        (("s1", slice(0, 3)), {"s1": "t"}),
+        (("s1", slice(3, 6)), {"s1": "R"}),
+        (("s0", slice(3, 6)), {"s0": "tR", "s1": "tR", "s2": "tR"}),
+        (("s0", slice(6, 7)), {"s0": "d", "s1": "d", "s2": "d"}),
+        (("s2", slice(6, 7)), {"s2": "d"}),
+    ],
+)
+def test_what_the_truth_leaves_open_stays_open(unknown, lost):
+    sensors = [sensor(f"s{k}", T) for k, T in enumerate(MOUNTS[:3])]
+    there = truth(sensors)
+    there.determined[there.index(unknown[0]), unknown[1]] = False
+    seen = drives.rebased(there, ("s0", "s1", "s2"), "a drive").determined
+    for k, name in enumerate(("s0", "s1", "s2")):
+        told = lost.get(name, "")
+        assert seen[k].tolist() == ["t" not in told] * 3 + ["R" not in told] * 3 + ["d" not in told]
+
+
+def test_sensors_that_the_truth_does_not_hold_are_refused():
+    there = truth([sensor("velo", LIDAR), sensor("ins", INS)])
+    with pytest.raises(DataError, match=r"truth of a drive holds nothing on sensor 'cam9', only on velo, ins; leave"):
+        drives.rebased(there, ("velo", "cam9"), "a drive")
+
+
+def test_the_paper_decides_which_sensors_are_compared(two, ring):
+    both = Log(None, {**ring.log.streams, **two.log.streams})
+    assert drives.cameras(both) == ["cam0", "cam1", "cam2"]
+    assert drives.first_two(both) == ["velo", "ins"]
+    with pytest.raises(DataError, match="has no camera, where this experiment compares at least two"):
+        drives.cameras(two.log)
+    with pytest.raises(DataError, match="no two sensors that measure distances"):
+        drives.first_two(ring.log)
+
+
+# ---- errors
+
+
+def test_a_rotation_error_is_the_turn_from_the_estimate_to_the_truth():
+    R_est = Rotation.from_rotvec([0.3, -1.2, 0.7]).as_matrix()
+    delta = np.array([0.02, -0.01, 0.03])
+    found = rotation_error(se3.exp_so3(delta) @ R_est @ R_est.T)
+    np.testing.assert_allclose([found[k] for k in ("rx", "ry", "rz")], np.degrees(delta))
+    assert found["rotation"] == pytest.approx(np.degrees(np.linalg.norm(delta)))
+    turn = Rotation.from_euler("ZYX", [3.0, -2.0, 1.0], degrees=True).as_matrix()
+    euler = rotation_error(turn)
+    np.testing.assert_allclose([euler[k] for k in ("roll", "pitch", "yaw")], [1.0, -2.0, 3.0])
+
+
+def test_monte_carlo_sigma_of_euler_angles_is_the_linear_one_where_small():
+    A = np.random.default_rng(4).normal(size=(3, 3))
+    cov = A @ A.T * np.radians(0.4) ** 2
+    np.testing.assert_allclose(euler_sigma(cov), np.sqrt(np.diag(cov)), rtol=0.03)
+    stated = rotation_sigma(cov)
+    np.testing.assert_allclose([stated[k] for k in ("rx", "ry", "rz")], np.degrees(np.sqrt(np.diag(cov))))
+    assert not euler_sigma(np.zeros((3, 3))).any()
+
+
+def test_monte_carlo_sigma_of_euler_angles_knows_large_turns():
+    cov = np.diag(np.radians([5.0, 60.0, 5.0]) ** 2)
+    many = Rotation.from_rotvec(np.random.default_rng(9).multivariate_normal(np.zeros(3), cov, size=100_000))
+    np.testing.assert_allclose(euler_sigma(cov), many.as_euler("ZYX")[:, ::-1].std(axis=0), rtol=0.05)
+    assert np.abs(euler_sigma(cov)[1] / np.radians(60.0) - 1) > 0.1  # pitch ends at a right angle
+
+
+# ---- baselines
+
+
+def test_least_squares_is_exact_without_noise():
+    steps = known_times(path(30.0, 2, "rough"), [LIDAR, INS], np.array(QUIET), 1)
+    np.testing.assert_allclose(baselines.least_squares(steps), in_base([LIDAR, INS])[1], atol=1e-4)
+
+
+def test_least_squares_weighs_every_step_alike():
+    """One wild step pulls it; the paper's estimator does not move for that (its own tests)."""
+    steps = known_times(path(30.0, 2, "rough"), [LIDAR, INS], np.array(QUIET), 1)
+    steps.vec[1, 40, :3] += [5.0, 0.0, 0.0]
+    assert np.linalg.norm(baselines.least_squares(steps)[:3, 3] - in_base([LIDAR, INS])[1, :3, 3]) > 0.01
+
+
+def test_least_squares_knows_no_position_without_scale():
+    steps = known_times(path(30.0, 2, "rough"), [LIDAR, CAMERA], np.array(QUIET), 1, cameras=[1])
+    T = baselines.least_squares(steps)
+    np.testing.assert_allclose(T[:3, :3], exact_turns([LIDAR, CAMERA]).R_base_sensor[1], atol=1e-5)
+    assert np.isnan(T[:3, 3]).all()
+
+
+@pytest.mark.skipif(not baselines.opencv_has_hand_eye(), reason="this OpenCV has no calibrateHandEye")
+@pytest.mark.parametrize("method", baselines.OPENCV_METHODS)
+def test_opencv_is_asked_in_its_own_convention(method):
+    steps = known_times(path(60.0, 2, "rough"), [LIDAR, INS], np.array(QUIET), 1)
+    T = baselines.opencv_hand_eye(steps, method)
+    np.testing.assert_allclose(T, in_base([LIDAR, INS])[1], atol=2e-3)
+    # steps may be missing: what is left still belongs together
+    keep = np.random.default_rng(1).random(len(steps)) < 0.7
+    np.testing.assert_allclose(baselines.opencv_hand_eye(steps[keep], method), T, atol=2e-3)
+
+
+def test_opencv_refuses_a_camera():
+    steps = known_times(path(30.0, 2, "rough"), [LIDAR, CAMERA], np.array(QUIET), 1, cameras=[1])
+    with pytest.raises(NotObservableError, match="two sensors that measure distances"):
+        baselines.opencv_hand_eye(steps, "opencv-park")
+
+
+# ---- one repeat
+
+
+def test_timing_finds_the_clocks_that_were_moved(ring):
+    found = measure_timing(cut(Draw(0, 50.0, 1.0, 1), [ring], "timing", 0), FAST, ["paper"])
+    assert [f.sensor for f in found] == ["cam1", "cam2"]
+    for f in found:
+        assert abs(f.error["dt"]) < 5
+        assert 0 < f.sigma["dt"] < 5
+
+
+def test_clocks_without_a_truth_have_no_error(ring):
+    section = cut(Draw(0, 50.0, 1.0, 1), [ring], "timing", 0)
+    section.truth.determined[2, 6] = False
+    try:
+        found = measure_timing(section, FAST, ["paper"])
+    finally:
+        section.truth.determined[2, 6] = True
+    assert [set(f.error) for f in found] == [{"dt"}, set()]
+
+
+def test_a_pair_is_told_beside_least_squares(two):
+    ours, plain = measure_pair(cut(Draw(0, 50.0, 0.0, 0), [two], "pair", 0), FAST, ["paper", "least-squares"])
+    assert (ours.sensor, plain.sensor) == ("velo-ins", "velo-ins")
+    assert ours.error["rotation"] < 0.5
+    assert ours.error["translation"] < 0.3
+    assert abs(ours.error["dt"]) < 5
+    total = np.linalg.norm([ours.error[k] for k in "xyz"])
+    assert ours.error["translation"] == pytest.approx(total)
+    assert set(ours.sigma) == {"roll", "pitch", "yaw", "rx", "ry", "rz", "x", "y", "z", "dt"}
+    assert plain.error["rotation"] < 2
+    assert plain.sigma == {}
+    assert "dt" not in plain.error
+
+
+def test_what_is_not_determined_has_no_error():
+    sensors = [sensor("velo", LIDAR), sensor("ins", INS)]
+    planar = drives.Drive("planar", None, drive(path(40.0, 3, "planar"), sensors, 3), ("velo", "ins"), truth(sensors))
+    (ours,) = measure_pair(cut(Draw(0, 35.0, 0.0, 0), [planar], "pair", 0), FAST, ["paper"])
+    # turning about one axis only: nothing tells the yaw of the other sensor, nor so where it sits
+    assert {"yaw", "rz", "rotation", "z", "translation"} <= set(ours.undetermined)
+    assert not set(ours.undetermined) & (set(ours.error) | set(ours.sigma))
+    assert {"roll", "pitch", "dt"} <= set(ours.error)
+    assert max(abs(ours.error["roll"]), abs(ours.error["pitch"])) < 1
+
+
+def test_a_ring_of_cameras_is_told_together_and_apart(ring):
+    methods = ["paper-together", "paper-separate", "least-squares"]
+    found = measure_panoramic(cut(Draw(0, 50.0, 0.0, 0), [ring], "panoramic", 0), FAST, methods)
+    pairs = ["cam0-cam1", "cam0-cam2", "cam1-cam2"]
+    assert [(f.estimator, f.sensor) for f in found] == [(m, p) for m in methods for p in pairs]
+    assert max(f.error["rotation"] for f in found) < 1.0
+    assert [bool(f.sigma) for f in found] == [True] * 3 + [False] * 6
+    together = np.array([[f.error[k] / f.sigma[k] for k in ("rx", "ry", "rz")] for f in found[:3]])
+    assert np.sqrt(np.mean(together**2)) < 4
+
+
+def test_roll_of_a_camera_is_about_its_optical_axis():
+    np.testing.assert_allclose(FORWARD_LEFT_UP @ [0, 0, 1], [1, 0, 0])  # ahead
+    np.testing.assert_allclose(FORWARD_LEFT_UP @ [1, 0, 0], [0, -1, 0])  # right
+    np.testing.assert_allclose(FORWARD_LEFT_UP @ [0, 1, 0], [0, 0, -1])  # down
+
+
+# ---- protocols
+
+
+@pytest.mark.parametrize("name", ["appearance", "full"])
+def test_experiments_on_appearance_say_what_they_wait_for(name):
+    with pytest.raises(ConfigError, match=rf"'{name}' \(Fig\. 1.*no installed plugin brings one; run one of: timing"):
+        protocol(name)
+
+
+def test_the_papers_lengths_and_spreads_are_the_defaults():
+    assert PROTOCOLS["timing"].seconds == tuple(range(10, 201, 10))
+    assert PROTOCOLS["timing"].spreads == (0.1, 1.0)
+    assert PROTOCOLS["pair"].seconds == tuple(range(10, 301, 10))
+    assert PROTOCOLS["panoramic"].seconds == (30,)
+
+
+def test_the_papers_numbers_stand_where_they_belong():
+    assert beside("timing", "dt", 200.0, 1.0).startswith("KITTI 6, worst 40; Shrimp 2, worst 9; his files")
+    assert beside("timing", "dt", 200.0, 0.1) == ""
+    assert "1.69" in beside("panoramic", "rotation", 30.0, 0.0)
+    assert "IM 100 %" in beside("appearance", "within 0.3 m and 2 deg", 100.0, 0.0)
+    assert "6.3, 7.5, 2.0 cm" in beside("full", "mean error", 100.0, 0.0)
+
+
+# ---- the experiment and its table
+
+
+def run(two, folder, repeats=3, seed=0, seconds=(20.0,)):
+    return experiment.run(
+        "pair", [two], folder, experiment.Choices(repeats, seconds), replace(FAST, seed=seed), Silent()
+    )
+
+
+def test_every_repeat_has_its_rows(two, tmp_path):
+    done = run(two, tmp_path)
+    assert [(r["repeat"], r["estimator"]) for r in done.rows] == [
+        (str(k), m) for k in range(3) for m in ("paper", "least-squares")
+    ]
+    lines = (tmp_path / "pair.csv").read_text().splitlines()
+    assert len(lines) == 7
+    assert tuple(lines[0].split(",")) == experiment.columns(PROTOCOLS["pair"])
+    assert {r["status"] for r in done.rows} == {"found"}
+    settings = json.loads((tmp_path / "pair.json").read_text())
+    assert settings["repeats"] == 3
+    assert settings["sensors"] == ["velo", "ins"]
+    assert "jobs" not in json.dumps(settings)
+
+
+def test_a_cut_table_is_completed_to_the_same_bytes(two, tmp_path):
+    run(two, tmp_path)
+    file = tmp_path / "pair.csv"
+    whole = file.read_bytes()
+    lines = whole.splitlines(keepends=True)
+    worked = []
+
+    class Watching(Silent):
+        def begin(self, task, total, done=0):
+            worked.append(total - done)
+
+    for left in (
+        b"",
+        lines[0],
+        b"".join(lines[:3]),
+        b"".join([lines[0], *lines[5:7], lines[3], lines[4][:30]]),  # out of order, cut inside a number
+        b"".join(lines[:-1]) + lines[-1].rstrip(b"\n"),
+        whole,
+    ):
+        file.write_bytes(left)
+        choices = experiment.Choices(3, (20.0,))
+        experiment.run("pair", [two], tmp_path, choices, FAST, Watching())
+        assert file.read_bytes() == whole
+    assert worked == [3, 3, 2, 2, 1, 0]
+
+
+def test_finished_rows_are_taken_as_they_are(two, tmp_path):
+    run(two, tmp_path)
+    file = tmp_path / "pair.csv"
+    rows = file.read_text().splitlines()
+    rows[1] = rows[1].replace("velo-ins", "velo-ins", 1).replace(",found,", ",found,", 1)
+    marked = rows[1].split(",")
+    marked[9] = "123.456"
+    file.write_text("\n".join([rows[0], ",".join(marked), *rows[2:]]) + "\n")
+    assert "123.456" in [v for r in run(two, tmp_path).rows for v in r.values()]
+
+
+def test_other_settings_are_refused(two, tmp_path):
+    run(two, tmp_path)
+    before = (tmp_path / "pair.csv").read_bytes()
+    for changed, sentence in (
+        ({"repeats": 4}, "pair.csv was begun with repeats = 3, and this is 4; give the same, or choose another"),
+        ({"seed": 1}, "begun with seed = 0, and this is 1"),
+        ({"seconds": (21.0,)}, r"begun with seconds = \[20.0\], and this is \[21.0\]"),
+    ):
+        with pytest.raises(DataError, match=sentence):
+            run(two, tmp_path, **changed)
+    other = a_drive([sensor("velo", LIDAR), sensor("ins", INS)], seed=4)
+    with pytest.raises(DataError, match="begun with data = "):
+        run(other, tmp_path)
+    assert (tmp_path / "pair.csv").read_bytes() == before
+
+
+def test_a_table_of_unknown_settings_is_refused(two, tmp_path):
+    (tmp_path / "pair.csv").write_text("drive\n")
+    with pytest.raises(DataError, match=r"pair\.csv is there without its settings pair\.json"):
+        run(two, tmp_path)
+    (tmp_path / "pair.json").write_text("{")
+    with pytest.raises(DataError, match=r"pair\.json can not be read"):
+        run(two, tmp_path)
+
+
+def test_a_table_with_other_columns_is_refused(tmp_path):
+    Store(tmp_path, "t", {}, ["a", "b"]).rewrite([{"a": "1", "b": "2"}])
+    with pytest.raises(DataError, match="has other columns"):
+        Store(tmp_path, "t", {}, ["a", "c"]).read()
+
+
+def test_rows_survive_commas_quotes_and_letters(tmp_path):
+    store = Store(tmp_path, "t", {}, ["a", "note"])
+    rows = [{"a": "1", "note": 'a "b", c; µ'}, {"a": "2", "note": ""}]
+    store.rewrite(rows)
+    store.append([{"a": "3", "note": "x"}])
+    assert store.read() == [*rows, {"a": "3", "note": "x"}]
+    with store.table.open("ab") as file:
+        file.write("4,µ".encode()[:-1])  # half a letter
+    assert len(store.read()) == 3
+
+
+def test_a_refusal_is_a_row(tmp_path):
+    sensors = [sensor("velo", LIDAR), sensor("ins", INS)]
+    still = drives.Drive(
+        "still", Log(tmp_path, {}), drive(path(40.0, 3, "static"), sensors, 3), ("velo", "ins"), truth(sensors)
+    )
+    rows = run(still, tmp_path, repeats=2).rows
+    assert {r["status"] for r in rows} == {"refused"}
+    assert len(rows) == 4
+    assert all(len(r["note"]) > 20 and not r["rotation_deg"] for r in rows)
+    text = summary.markdown("pair", rows, [])
+    assert "4 rows from still, 4 of them refused" in text
+    assert f"- 2 x paper: {rows[0]['note']}" in text
+
+
+def test_a_truth_that_does_not_tell_enough_is_refused(two, ring, tmp_path):
+    def without(drive, rows, columns):
+        known = drive.truth.determined.copy()
+        known[rows, columns] = False
+        return replace(drive, truth=replace(drive.truth, determined=known))
+
+    choices, config = experiment.Choices(1, (20.0,)), FAST
+    with pytest.raises(DataError, match="does not say how it is turned of ins against velo"):
+        experiment.run("pair", [without(two, 1, slice(3, 6))], tmp_path, choices, config, Silent())
+    with pytest.raises(DataError, match="does not say how late the clock is of cam1, cam2 against cam0"):
+        experiment.run("timing", [without(ring, slice(None), 6)], tmp_path, choices, config, Silent())
+    with pytest.raises(DataError, match="drives of one experiment have the same sensors"):
+        experiment.run("pair", [two, ring], tmp_path, choices, config, Silent())
+    with pytest.raises(DataError, match=r"no recording lasts long enough: 500 s: longer than rough \(5"):
+        experiment.run("pair", [two], tmp_path, experiment.Choices(1, (500.0,)), config, Silent())
+    assert not list(tmp_path.iterdir())
+
+
+# ---- statistics
+
+
+def rows_of(values, **more):
+    """Rows of the timing table with these errors and a sigma of one; None refused, nan not determined."""
+    base = {"drive": "d", "seconds": "20", "spread": "1", "estimator": "paper", "sensor": "cam1", "note": ""}
+    made = []
+    for k, v in enumerate(values):
+        row = {**base, **more, "repeat": str(k), "status": "found", "undetermined": ""}
+        row |= {"dt_ms": "", "sigma_dt_ms": ""}
+        if v is None:
+            row |= {"status": "refused", "note": "it stood still"}
+        elif np.isnan(v):
+            row["undetermined"] = "dt"
+        else:
+            row |= {"dt_ms": str(v), "sigma_dt_ms": "1"}
+        made.append(row)
+    return made
+
+
+def test_statistics_are_those_of_the_absolute_errors():
+    s = summary.statistics(rows_of([0.5, -1.5, 2.5, -4.0, None, np.nan]), "dt")
+    assert s.error.tolist() == [0.5, 1.5, 2.5, 4.0]
+    assert (s.sections, s.refused, s.undetermined, s.no_truth) == (6, 1, 1, 0)
+    assert [np.mean(s.ratio < k) for k in (1, 2, 3)] == [0.25, 0.5, 0.75]
+    head, line = summary.table("timing", rows_of([0.5, -1.5, 2.5, -4.0, None, np.nan]), "dt")
+    told = dict(zip(head, line, strict=True))
+    assert (told["median"], told["worst"], told["mean"]) == ("2.00", "4.00", "2.12")
+    assert told["p95"] == f"{np.percentile([0.5, 1.5, 2.5, 4.0], 95):.2f}"
+    assert told["RMS"] == f"{np.sqrt((0.25 + 2.25 + 6.25 + 16) / 4):.2f}"
+    assert told["within 1/2/3 sigma %"] == "25/50/75"
+    assert (told["sections"], told["refused"], told["left open"]) == ("6", "1", "1")
+
+
+def test_a_length_that_was_always_refused_keeps_its_line():
+    head, line = summary.table("timing", rows_of([None, None]), "dt")
+    told = dict(zip(head, line, strict=True))
+    assert (told["median"], told["sections"], told["refused"]) == ("", "2", "2")
+
+
+def test_euler_errors_are_held_against_sigma_as_delta():
+    row = {"drive": "d", "repeat": "0", "status": "found", "undetermined": ""}
+    row |= {"roll_deg": "1", "sigma_roll_deg": "9", "rx_deg": "1.5", "sigma_rx_deg": "0.5"}
+    s = summary.statistics([row], "roll")
+    assert (s.error.tolist(), s.sigma.tolist(), s.ratio.tolist()) == ([1.0], [9.0], [3.0])
+
+
+def test_lines_come_by_spread_then_length():
+    rows = rows_of([1.0], seconds="100") + rows_of([1.0], seconds="20") + rows_of([1.0], spread="0.1")
+    assert [(a, b) for a, b, _, _ in summary.groups(rows)] == [(0.1, 20.0), (1.0, 20.0), (1.0, 100.0)]
+
+
+# ---- pictures
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_figures_are_drawn(name, two, ring, tmp_path):
+    from matplotlib.image import imread
+
+    over = two if name == "pair" else ring
+    done = experiment.run(
+        name, [over], tmp_path, experiment.Choices(2, (15.0, 20.0)), FAST, Silent()
+    )  # fmt: skip
+    figures.draw(name, done.rows, tmp_path / "figure.png")
+    image = imread(tmp_path / "figure.png")
+    assert image.shape[0] > 300
+    assert 0.5 < image[..., :3].mean() < 0.99
+
+
+def test_figures_stand_a_table_without_any_number(tmp_path):
+    figures.draw("timing", rows_of([None, np.nan]), tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").stat().st_size > 1000
+
+
+def sphere(directions):
+    """A colour for each direction of the world."""
+    yaw, up = np.arctan2(directions[..., 1], directions[..., 0]), directions[..., 2]
+    channels = [128 + 100 * np.sin(3 * yaw), 128 + 100 * np.cos(2 * yaw + up), 128 + 100 * up]
+    return np.clip(np.stack(channels, axis=-1), 0, 255).astype(np.uint8)
+
+
+def views_of(R, K, size):
+    """What ideal cameras at R (in the first one's axes) see of the sphere."""
+    u, v = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u, dtype=float)], axis=-1)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    return [sphere((rays @ r.T) @ FORWARD_LEFT_UP.T) for r in R]
+
+
+def ring_of_five():
+    turns = se3.exp_so3(np.radians(np.arange(0, 360, 72))[:, None] * [0.0, 1.0, 0.0])
+    K = np.array([[150.0, 0, 160], [0, 150.0, 200], [0, 0, 1]])
+    return turns, K, (320, 400)
+
+
+@pytest.fixture
+def small_panorama(monkeypatch):
+    monkeypatch.setattr(panorama, "SIZE", (480, 240))
+
+
+def test_a_panorama_from_true_rotations_is_the_sphere(small_panorama):
+    R, K, size = ring_of_five()
+    views = [(i, CameraIntrinsics(K), r) for i, r in zip(views_of(R, K, size), R, strict=True)]
+    made = panorama.panorama(views).astype(float)
+    expected = sphere(panorama._rays()).astype(float)
+    level = slice(83, 157)  # all around the horizon there is a camera
+    assert made[level].any(axis=-1).all()
+    assert np.abs(made[level] - expected[level]).mean() < 1.5
+    assert not made[:33].any()
+    wrong = [(i, k, r @ se3.exp_so3(np.radians([0, 5.0, 0]))) for i, k, r in views]
+    assert np.abs(panorama.panorama(wrong)[level] - expected[level]).mean() > 5
+
+
+def test_the_mean_rotation_is_read_back_from_the_table(ring, tmp_path):
+    done = experiment.run(
+        "panoramic", [ring], tmp_path, experiment.Choices(1, (50.0,)), FAST, Silent()
+    )  # fmt: skip
+    names = list(ring.motions)
+    R = panorama.mean_rotations(done.rows, names, ring.truth.T_base_sensor[:, :3, :3])
+    for k, name in enumerate(names[1:], start=1):
+        (row,) = [r for r in done.rows if r["sensor"] == f"cam0-{name}" and r["estimator"] == "paper-together"]
+        off = np.degrees(np.linalg.norm(se3.log_so3(ring.truth.T_base_sensor[k, :3, :3] @ R[k].T)))
+        assert off == pytest.approx(float(row["rotation_deg"]), rel=1e-4)
+    from calib_toolkit import calibrate_motions
+
+    section = cut(Draw(0, 50.0, 0.0, 0), [ring], "panoramic", 0)
+    there = calibrate_motions(section.motions, FAST, section.clocks).calibration.T_base_sensor[:, :3, :3]
+    np.testing.assert_allclose(R, there, atol=1e-5)
+    refused = [{**r, "status": "refused", "rx_deg": ""} for r in done.rows]
+    assert panorama.mean_rotations(refused, names, ring.truth.T_base_sensor[:, :3, :3]) is None
+
+
+def test_the_panorama_is_drawn_from_images_or_says_why_not(ring, tmp_path, small_panorama):
+    done = experiment.run(
+        "panoramic", [ring], tmp_path, experiment.Choices(1, (50.0,)), FAST, Silent()
+    )  # fmt: skip
+    sentence = panorama.draw(ring, done.rows, tmp_path / "panorama.png")
+    assert sentence.startswith("no panorama: ")
+    assert sentence.endswith("holds no images, only motions of cam0")
+    assert not (tmp_path / "panorama.png").exists()
+
+    _, K, size = ring_of_five()
+    R = ring.truth.T_base_sensor[:, :3, :3]
+    stamps = np.array([0.0, 30.0])
+    seen = views_of(R, K, size)
+    streams = {
+        n: Stream(n, "monocular", stamps, [np.zeros_like(i), i], CameraIntrinsics(K), has_scale=False)
+        for n, i in zip(ring.motions, seen, strict=True)
+    }
+    with_images = drives.Drive("d", Log(tmp_path, streams), ring.motions, ring.clocks, ring.truth)
+    assert panorama.draw(with_images, done.rows, tmp_path / "panorama.png") == (
+        "panorama of cam0, cam1, cam2: panorama.png"
+    )
+    blind = {n: Stream(n, "monocular", s.stamps, s.readings, has_scale=False) for n, s in streams.items()}
+    without = drives.Drive("d", Log(tmp_path, blind), ring.motions, ring.clocks, ring.truth)
+    assert "does not hold the intrinsics of cam0" in panorama.draw(without, done.rows, tmp_path / "p.png")
+
+
+def test_cameras_stamped_by_one_trigger_share_a_clock(ring):
+    stamps = np.arange(10.0)
+    streams = {
+        n: Stream(n, "odometry", stamps + late, list(range(10))) for n, late in (("a", 0.0), ("b", 0.0), ("c", 0.1))
+    }
+    assert drives._clocks(Log(None, streams)) == ("a", "a", "c")
+
+
+def test_errors_are_of_the_family():
+    assert issubclass(ConfigError, CalibrationError)
+    assert isinstance(truth([sensor("velo", LIDAR)]), Calibration)

@@ -1,0 +1,114 @@
+"""``calib-toolkit evaluate``: the paper's experiments on drives whose truth is known."""
+
+import os
+from pathlib import Path
+from typing import Literal
+
+import click
+
+NAMES = ("timing", "pair", "panoramic", "appearance", "full")
+LEFT_TO_THE_FILE = ("mean", "RMS", "sigma", "sections", "no truth", "paper")
+"""Columns of the summary that a terminal has no room for."""
+
+
+@click.command()
+@click.argument("protocol", type=click.Choice(NAMES))
+@click.argument("drives", metavar="DRIVE...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "-o",
+    "--out",
+    required=True,
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Folder for table and figure.",
+)
+@click.option("--sensors", metavar="A,B,...", help="Sensors to compare; the cameras, or for 'pair' the first two.")
+@click.option("--truth", type=click.Path(path_type=Path), help="calibration.json to compare with, for all drives.")
+@click.option(
+    "--repeats", type=click.IntRange(min=1), default=100, show_default=True, help="Sections of each length."
+)
+@click.option("--seconds", metavar="A,B,...", help="Lengths of the sections; the paper's by default.")
+@click.option("--baseline", is_flag=True, help="Run least squares and OpenCV's hand-eye calibration beside.")
+@click.option("--method", type=click.Choice(["paper"]), default="paper", show_default=True, help="Estimator.")
+@click.option("--jobs", type=click.IntRange(min=1), help="Processes; one for each core by default.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the sections.")
+def evaluate(
+    protocol: str,
+    drives: tuple[Path, ...],
+    out: Path,
+    sensors: str | None,
+    truth: Path | None,
+    repeats: int,
+    seconds: str | None,
+    baseline: bool,
+    method: str,
+    jobs: int | None,
+    seed: int,
+) -> None:
+    """Repeat one of the paper's experiments on random sections of drives whose truth is known.
+
+    PROTOCOL is timing (clock offsets), pair (two sensors), panoramic (a ring of cameras), appearance or full. Writes
+    a table, a summary and a figure to the folder; the same command goes on where a killed one stopped. Exit status 0
+    when every repeat has its rows, refused ones included; 1 when nothing can be compared, with the reason.
+    """
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")  # the processes are the parallelism
+    from calib_toolkit.cli.bars import bars
+    from calib_toolkit.config import Config
+    from calib_toolkit.evaluation import experiment, figures, panorama, summary
+    from calib_toolkit.evaluation.drives import open_drives
+    from calib_toolkit.evaluation.errors import UNITS
+    from calib_toolkit.evaluation.protocols import protocol as named
+    from calib_toolkit.result_file import read_calibration
+
+    chosen = named(protocol)
+    lengths = _lengths(seconds) or chosen.seconds
+    config = Config(method=method, seed=seed, jobs=jobs or os.cpu_count() or 1)
+    known = read_calibration(truth) if truth else None
+    names = _names(sensors)
+    with bars() as progress:
+        opened = open_drives(drives, (lambda _: names) if names else chosen.choose, known, config, progress)
+        choices = experiment.Choices(repeats, lengths, baseline)
+        done = experiment.run(protocol, opened, out, choices, config, progress)
+    notes = experiment.notes(protocol, choices)
+    if protocol == "panoramic":
+        notes.append(panorama.draw(opened[0], done.rows, out / "panorama.png"))
+    figures.draw(protocol, done.rows, out / f"{protocol}.png")
+    (out / f"{protocol}.md").write_text(summary.markdown(protocol, done.rows, done.skipped, notes), encoding="utf-8")
+    for parameter in chosen.short:
+        _show(f"{parameter}, {UNITS[parameter]}", summary.table(protocol, done.rows, parameter))
+    refused = sum(row["status"] == "refused" for row in done.rows)
+    click.echo(f"{len(done.rows)} rows, {refused} of them refused")
+    for note in (*done.skipped, *notes):
+        click.echo(note)
+    click.echo(f"written: {', '.join(str(out / f'{protocol}.{end}') for end in ('csv', 'md', 'png'))}")
+
+
+def _show(title: str, lines: list[list[str]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    if not lines:
+        return
+    told = [any(cells) for cells in zip(*lines[1:], strict=True)]
+    shown = [k for k, column in enumerate(lines[0]) if told[k] and column not in LEFT_TO_THE_FILE]
+    table = Table(title=title, title_justify="left", box=None, padding=(0, 2, 0, 0))
+    for k in shown:
+        side: Literal["left", "right"] = "left" if lines[0][k] == "estimator" else "right"
+        table.add_column(lines[0][k].replace(" ", "\n"), justify=side, no_wrap=True)
+    for cells in lines[1:]:
+        table.add_row(*(cells[k] for k in shown))
+    Console(highlight=False, markup=False).print(table, "")
+
+
+def _names(sensors: str | None) -> list[str]:
+    return [n.strip() for n in (sensors or "").split(",") if n.strip()]
+
+
+def _lengths(seconds: str | None) -> tuple[float, ...]:
+    try:
+        lengths = tuple(float(s) for s in (seconds or "").split(",") if s.strip())
+    except ValueError as e:
+        raise click.BadParameter(f"{seconds!r} is not a list of numbers", param_hint="--seconds") from e
+    if not all(1.0 <= s < float("inf") for s in lengths) or len(set(lengths)) < len(lengths):
+        raise click.BadParameter("each length is at least one second, and given once", param_hint="--seconds")
+    return lengths

@@ -1,0 +1,78 @@
+"""Random parts of the drives: which, from when, and with what offsets, told by the seed alone."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_toolkit.evaluation.drives import Drive
+from calib_toolkit.types import Calibration, Motions
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One repeat before it is cut. drive: which of the drives. seconds: its length. spread: how far clocks are
+    moved, seconds.
+    """
+
+    drive: int
+    seconds: float
+    spread: float
+    repeat: int
+
+
+@dataclass(frozen=True)
+class Section:
+    """One repeat: part of a drive whose clocks were moved. start: seconds after the drive's first common instant.
+
+    motions: the base first. truth: of these sensors, with the moved clocks.
+    """
+
+    start: float
+    motions: Mapping[str, Motions]
+    clocks: tuple[str, ...]
+    truth: Calibration
+
+
+def plan(
+    drives: Sequence[Drive], seconds: Sequence[float], spreads: Sequence[float], repeats: int
+) -> tuple[list[Draw], list[str]]:
+    """Everything that is to be done, drives in turn; and a sentence on each drive that is too short for a length."""
+    draws, skipped = [], []
+    for length in seconds:
+        lasting = [_lasting(d) for d in drives]
+        enough = [k for k, lasts in enumerate(lasting) if lasts >= length]
+        short = [d.name for k, d in enumerate(drives) if k not in enough]
+        if short:
+            skipped.append(
+                f"{length:g} s: longer than {', '.join(short)} ({max(t for t in lasting if t < length):.1f} s), "
+                f"{'left out there' if enough else 'left out'}"
+            )
+        if enough:
+            draws += [Draw(enough[r % len(enough)], length, spread, r) for spread in spreads for r in range(repeats)]
+    return draws, skipped
+
+
+def cut(draw: Draw, drives: Sequence[Drive], protocol: str, seed: int) -> Section:
+    """The part that a draw stands for: a function of seed, protocol, length and repeat only, scaled by the spread."""
+    drive = drives[draw.drive]
+    rng = np.random.default_rng([seed, crc32(protocol.encode()), round(1000 * draw.seconds), draw.repeat])
+    start = rng.random() * (_lasting(drive) - draw.seconds)
+    moved = draw.spread * np.array([0.0, *rng.uniform(-1, 1, len(drive.motions) - 1)])
+    first = drive.span[0] + start
+    parts = {
+        name: m[(m.start >= first) & (m.end <= first + draw.seconds)].shifted(d)
+        for (name, m), d in zip(drive.motions.items(), moved, strict=True)
+    }
+    gained = drive.truth.clock_skew * (first + draw.seconds / 2 - drive.truth.t_ref)
+    truth = replace(drive.truth, dt_base_sensor=drive.truth.dt_base_sensor + gained - moved)
+    return Section(start, parts, drive.clocks, truth)
+
+
+def _lasting(drive: Drive) -> float:
+    first, last = drive.span
+    return last - first

@@ -1,0 +1,143 @@
+"""The table of an experiment in numbers that can be compared: Markdown."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_toolkit.evaluation.errors import DELTA, EULER, UNITS
+from calib_toolkit.evaluation.paper import beside
+from calib_toolkit.evaluation.protocols import PROTOCOLS
+from calib_toolkit.evaluation.store import Row
+
+Array = NDArray[np.float64]
+
+CHECKED_AS = dict(zip(EULER, DELTA, strict=True))
+"""A stated sigma is of ``delta``, so errors are held against it as delta and not as Euler angles."""
+DIGITS = {"deg": 3, "m": 3, "ms": 2}
+TITLES = (
+    *("median", "p95", "worst", "mean", "RMS", "sigma", "within 1/2/3 sigma %"),
+    *("sections", "refused", "left open", "no truth"),
+)
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Of one parameter over all rows of one length, spread and estimator.
+
+    error: (k,) absolute errors; ratio: (k,) of those to their stated sigma, nan where none is stated; sigma: (k,).
+    sections, refused: how many repeats; undetermined, no_truth: how many rows the errors leave out.
+    """
+
+    error: Array
+    ratio: Array
+    sigma: Array
+    sections: int
+    refused: int
+    undetermined: int
+    no_truth: int
+
+
+def numbers(rows: Sequence[Row], column: str) -> Array:
+    """(m,) one column; nan where nothing is written."""
+    return np.array([float(r[column] or "nan") if column in r else np.nan for r in rows], dtype=float)
+
+
+def groups(rows: Sequence[Row]) -> Iterator[tuple[float, float, str, list[Row]]]:
+    """Rows by spread, length and estimator, in the order of the table: (spread, seconds, estimator, rows)."""
+    found: dict[tuple[float, float, str], list[Row]] = {}
+    for row in rows:
+        found.setdefault((float(row["spread"]), float(row["seconds"]), row["estimator"]), []).append(row)
+    # lengths first, as they are planned; a table is easier to read by spread
+    for spread, seconds, estimator in sorted(found, key=lambda k: k[:2]):
+        yield spread, seconds, estimator, found[spread, seconds, estimator]
+
+
+def statistics(rows: Sequence[Row], parameter: str) -> Statistics:
+    """Of one parameter over some rows."""
+    error, checked = (_column(rows, p) for p in (parameter, CHECKED_AS.get(parameter, parameter)))
+    sigma, stated = (_column(rows, f"sigma_{p}") for p in (parameter, CHECKED_AS.get(parameter, parameter)))
+    known = np.isfinite(error)
+    refused = np.array([r["status"] == "refused" for r in rows])
+    undetermined = np.array([parameter in r["undetermined"].split() for r in rows])
+    repeats = [(r["drive"], r["repeat"]) for r in rows]
+    return Statistics(
+        np.abs(error[known]),
+        np.abs(checked[known]) / stated[known],
+        sigma[known],
+        len(set(repeats)),
+        len({key for key, no in zip(repeats, refused, strict=True) if no}),
+        int(undetermined.sum()),
+        int((~known & ~refused & ~undetermined).sum()),
+    )
+
+
+def markdown(name: str, rows: Sequence[Row], skipped: Sequence[str], notes: Sequence[str] = ()) -> str:
+    """The whole summary: one table for each parameter, then what was skipped."""
+    experiment = PROTOCOLS[name]
+    parts = [f"# {experiment.title}", "", f"![{experiment.title}]({name}.png)", "", *_explained(rows)]
+    for parameter in experiment.parameters:
+        if lines := table(name, rows, parameter):
+            rule = ["---"] * len(lines[0])
+            parts += ["", f"## {parameter} ({UNITS[parameter]})", "", *map(_line, (lines[0], rule, *lines[1:]))]
+    left_out = [*(f"- {s}" for s in (*skipped, *notes)), *_refusals(rows)]
+    if left_out:
+        parts += ["", "## Left out", "", *left_out]
+    return "\n".join(parts) + "\n"
+
+
+def table(name: str, rows: Sequence[Row], parameter: str) -> list[list[str]]:
+    """Titles and cells of one parameter's table; nothing if nobody estimated it."""
+    spread_matters = len(PROTOCOLS[name].spreads) > 1
+    head = ["seconds", *(["moved by"] if spread_matters else []), "estimator", *TITLES, "paper"]
+    lines = []
+    for spread, seconds, estimator, some in groups(rows):
+        s = statistics(some, parameter)
+        if not len(s.error) and s.no_truth:
+            continue  # never estimated, or nobody knows better
+        where = [f"{seconds:g}", *([f"+-{spread:g} s"] if spread_matters else []), estimator]
+        paper = beside(name, parameter, seconds, spread)
+        lines.append([*where, *_cells(s, DIGITS[UNITS[parameter]]), paper])
+    return [head, *lines] if lines else []
+
+
+def _column(rows: Sequence[Row], parameter: str) -> Array:
+    return numbers(rows, f"{parameter}_{UNITS[parameter.removeprefix('sigma_')]}")
+
+
+def _cells(s: Statistics, digits: int) -> list[str]:
+    counts = [str(n) for n in (s.sections, s.refused, s.undetermined, s.no_truth)]
+    if not len(s.error):
+        return [""] * 7 + counts
+    e = s.error
+    values = [np.median(e), np.percentile(e, 95), e.max(), e.mean(), np.sqrt(np.mean(e**2))]
+    stated = np.isfinite(s.ratio).any()
+    ratio = s.ratio[np.isfinite(s.ratio)]
+    return [
+        *(f"{v:.{digits}f}" for v in values),
+        f"{np.nanmedian(s.sigma):.{digits}f}" if stated else "",
+        "/".join(f"{100 * np.mean(ratio < k):.0f}" for k in (1, 2, 3)) if stated else "",
+        *counts,
+    ]
+
+
+def _explained(rows: Sequence[Row]) -> list[str]:
+    drives = dict.fromkeys(r["drive"] for r in rows)
+    refused = sum(r["status"] == "refused" for r in rows)
+    return [
+        f"{len(rows)} rows from {', '.join(drives)}, {refused} of them refused. Absolute errors against the truth. "
+        "Sigma is the median of what was stated; within counts the errors below one, two and three times their own "
+        "stated sigma. Left open are values that an estimator says it did not determine: counted, and not among "
+        "the errors."
+    ]
+
+
+def _refusals(rows: Sequence[Row]) -> list[str]:
+    """Each kind of refusal once, with how often it came."""
+    notes = [f"{r['estimator']}: {r['note']}" for r in rows if r["status"] == "refused"]
+    return [f"- {notes.count(note)} x {note}" for note in dict.fromkeys(notes)]
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(c.replace("|", "/") for c in cells) + " |"
