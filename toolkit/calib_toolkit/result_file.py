@@ -70,7 +70,7 @@ def calibration_dict(c: Calibration) -> dict[str, Any]:
 def read_calibration(file: Path) -> Calibration:
     """The best calibration of a file in the schema of :func:`write_result`. Raises DataError.
 
-    ``base`` and each sensor's ``T_base_sensor`` must be there. Without sigma and covariance the values are taken
+    ``base`` and each sensor's ``T_base_sensor`` with a rotation must be there. Without sigma and covariance the values are taken
     as exact, except those that are null or missing, which are then not determined.
     """
     try:
@@ -90,8 +90,10 @@ def _calibration(d: dict[str, Any]) -> Calibration:
         raise ValueError("its base or the order of its covariance does not fit its sensors")
     if poses.shape != (n, 4, 4) or cov.shape != (7 * n, 7 * n):
         raise ValueError(f"poses of shape {poses.shape} and a covariance of shape {cov.shape} for {n} sensors")
-    turned = np.broadcast_to(np.isfinite(poses[:, :3, :3]).all(axis=(1, 2))[:, None], (n, 3))
-    known = np.column_stack([np.isfinite(poses[:, :3, 3]), turned, np.isfinite(dt)])
+    R = poses[:, :3, :3]
+    if not np.allclose(R @ np.swapaxes(R, 1, 2), np.eye(3), atol=1e-3) or not np.all(np.linalg.det(R) > 0):
+        raise ValueError("the rotation of a T_base_sensor is not one")
+    known = np.column_stack([np.isfinite(poses[:, :3, 3]), np.ones((n, 3), dtype=bool), np.isfinite(dt)])
     sigma = [[s["sigma"][p] for p in PARAMETERS] if "sigma" in s else [0.0] * 7 for s in sensors]
     known &= np.isfinite(np.array(sigma, dtype=float))
     return Calibration(

@@ -40,9 +40,10 @@ def simulate(
     sensors: str | None,
     jobs: int | None,
 ) -> None:
-    """Make a drive in the folder DST: raw scans, images and fixes, and truth.json with what is to be found.
+    """Make a drive whose truth is known.
 
-    Where a call was interrupted the same command goes on.
+    The folder DST gets raw scans, images and fixes in files as a real drive leaves them, and truth.json with what is to
+    be found. Where a call was interrupted the same command goes on.
     """
     import os
 

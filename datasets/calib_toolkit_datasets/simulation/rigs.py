@@ -203,8 +203,7 @@ def synced(rig: Rig) -> Rig:
 
     The rectified cameras share the axes of the first and stand on its x axis.
     """
-    cameras = [s for s in rig.sensors if isinstance(s.model, CameraModel)]
-    first = cameras[0].T_vehicle_sensor
+    first = next((s.T_vehicle_sensor for s in rig.sensors if isinstance(s.model, CameraModel)), np.eye(4))
     sensors = []
     for s in rig.sensors:
         model, T = s.model, s.T_vehicle_sensor
