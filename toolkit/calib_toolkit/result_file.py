@@ -70,8 +70,8 @@ def calibration_dict(c: Calibration) -> dict[str, Any]:
 def read_calibration(file: Path) -> Calibration:
     """The best calibration of a file in the schema of :func:`write_result`. Raises DataError.
 
-    ``base`` and each sensor's ``T_base_sensor`` with a rotation must be there. Without sigma and covariance the values are taken
-    as exact, except those that are null or missing, which are then not determined.
+    ``base`` and each sensor's ``T_base_sensor`` with a rotation must be there. Without sigma and covariance the
+    values are taken as exact, except those that are null or missing, which are then not determined.
     """
     try:
         return _calibration(json.loads(file.read_text()))

@@ -42,8 +42,8 @@ def simulate(
 ) -> None:
     """Make a drive whose truth is known.
 
-    The folder DST gets raw scans, images and fixes in files as a real drive leaves them, and truth.json with what is to
-    be found. Where a call was interrupted the same command goes on.
+    The folder DST gets raw scans, images and fixes in files as a real drive leaves them, and truth.json with what is
+    to be found. Where a call was interrupted the same command goes on.
     """
     import os
 
