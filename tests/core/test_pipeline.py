@@ -9,7 +9,7 @@ import pytest
 from builders import CAMERA, INS, LIDAR, drive, motions_of, pose, turn_error
 from numpy.testing import assert_allclose
 
-from calib_toolkit import Config, Log, Motions, calibrate, se3
+from calib_toolkit import Config, Log, Motions, calibrate, open_log, se3, write_calibration
 from calib_toolkit.errors import ConfigError, DataError, NotObservableError
 from calib_toolkit.pipeline import calibrate_motions
 from calib_toolkit.timing import TimingOptions
@@ -232,3 +232,23 @@ def test_what_the_paper_map_names_exists():
         if attribute:
             members = getattr(module, name)
             assert hasattr(members, attribute[0]) or attribute[0] in members.__dataclass_fields__
+
+
+def test_a_sensor_without_any_motion_is_refused_by_name():
+    (moving,) = drive(path(20, 0), [SimulatedSensor("lidar", LIDAR)], 0).values()
+    with pytest.raises(DataError, match="sensor camera has no motion in this part"):
+        calibrate_motions({"lidar": moving, "camera": moving[:0]})
+
+
+@pytest.mark.parametrize("named", [".", "rig.toml"])
+def test_a_truth_beside_a_recording_is_its_reference(tmp_path, named):
+    (tmp_path / "drive").mkdir()
+    sensors = "[sensors.lidar]\npose = [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]\n"
+    (tmp_path / "drive" / "simulated.toml").write_text(f"seconds = 2\nseed = 1\n{sensors}")
+    (tmp_path / "rig.toml").write_text('[sensors.lidar]\nlog = "drive"\n')
+    told = open_log(tmp_path / "drive").reference
+    assert told is not None
+    write_calibration(told, tmp_path / "truth.json")
+    reference = open_log(tmp_path / named).reference
+    assert reference is not None
+    assert reference.names == ("lidar",)

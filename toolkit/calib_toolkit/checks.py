@@ -1,17 +1,26 @@
 """What stops a calibration between its stages: each refusal is a sentence that says what to do."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from calib_toolkit import sync
 from calib_toolkit.errors import DataError, NotObservableError
-from calib_toolkit.types import Undetermined
+from calib_toolkit.types import Motions, Undetermined
 
 LARGEST_VEHICLE = 20.0
 """Metres: no two sensors are further apart."""
 FEWEST_STEPS = 20
 """Common steps below which nothing is worth estimating."""
+
+
+def moved(motions: Mapping[str, Motions]) -> None:
+    """Refuse sensors without any motion."""
+    still = [name for name, m in motions.items() if not len(m)]
+    if still:
+        raise DataError(
+            f"sensor {still[0]} has no motion in this part of the drive; take another part, or leave the sensor out"
+        )
 
 
 def overlap(names: Sequence[str], chains: Sequence[sync.Chain], max_offset: float) -> None:

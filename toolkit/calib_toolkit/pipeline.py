@@ -31,7 +31,8 @@ def open_log(path: Path | str, format_id: str | None = None, plugins: Registry |
     A ``truth.json`` in its folder, in the schema of calibration.json, becomes the log's reference.
     """
     log = (plugins or registry()).open_log(Path(path), format_id)
-    truth = Path(path) / TRUTH
+    folder = Path(path) if Path(path).is_dir() else Path(path).parent
+    truth = folder / TRUTH
     return replace(log, reference=read_calibration(truth)) if truth.is_file() else log
 
 
@@ -82,6 +83,7 @@ def calibrate_motions(
     config, progress = config or Config(), progress or Silent()
     progress.begin(STAGES, 3)
     names = tuple(motions)
+    checks.moved(motions)
     chains = [sync.chain(m) for m in motions.values()]
     checks.overlap(names, chains, config.timing.max_offset)
 

@@ -76,4 +76,4 @@ def _report(dst: Path, wish: "Wish", written: "list[Written]") -> None:
         click.echo(f"  {w.sensor:<{width}} {w.readings:7d} readings {speed}")
     size = sum(f.stat().st_size for f in dst.rglob("*") if f.is_file())
     click.echo(f"  {size / 1e9:.2f} GB; the truth is in {dst / 'truth.json'}")
-    click.echo(f"next: calib-toolkit run {dst} -o {dst.with_name(dst.name + '-out')}")
+    click.echo(f"next: calib-toolkit run {dst} -o {dst.resolve().with_name(dst.resolve().name + '-out')}")

@@ -15,7 +15,11 @@ RIG = "compact"
     "--seconds", type=click.FloatRange(min=10.0), default=70.0, show_default=True, help="Length of the drive."
 )
 @click.option(
-    "--seed", type=int, default=1, show_default=True, help="Each seed is another vehicle on another street."
+    "--seed",
+    type=click.IntRange(min=0),
+    default=1,
+    show_default=True,
+    help="Each seed is another vehicle on another street.",
 )
 @click.pass_context
 def demo(ctx: click.Context, out: Path, seconds: float, seed: int) -> None:

@@ -109,6 +109,8 @@ def _lengths(seconds: str | None) -> tuple[float, ...]:
         lengths = tuple(float(s) for s in (seconds or "").split(",") if s.strip())
     except ValueError as e:
         raise click.BadParameter(f"{seconds!r} is not a list of numbers", param_hint="--seconds") from e
+    if seconds is not None and not lengths:
+        raise click.BadParameter("no length is given", param_hint="--seconds")
     if not all(1.0 <= s < float("inf") for s in lengths) or len(set(lengths)) < len(lengths):
         raise click.BadParameter("each length is at least one second, and given once", param_hint="--seconds")
     return lengths

@@ -162,7 +162,10 @@ def _settings(
     except PackageNotFoundError:
         ours = "unknown"
     options: Mapping[str, Any] = {k: v for k, v in asdict(config).items() if k not in ("jobs", "seed", "method")}
-    data = cache.key_of([[d.motions, d.clocks, d.truth.T_base_sensor, d.truth.dt_base_sensor] for d in drives])
+    truths = [
+        (t.T_base_sensor, t.dt_base_sensor, t.clock_skew, t.t_ref, t.determined) for t in (d.truth for d in drives)
+    ]
+    data = cache.key_of([[d.motions, d.clocks, *told] for d, told in zip(drives, truths, strict=True)])
     return {
         "protocol": name,
         "drives": [d.name for d in drives],

@@ -28,6 +28,7 @@ def measure_timing(section: Section, config: Config, estimators: list[str]) -> l
     """Clock offsets of all sensors to the first, each on a clock of its own (section VIII-C)."""
     (method,) = estimators
     names, truth = list(section.motions), section.truth
+    checks.moved(section.motions)
     chains = [sync.chain(m) for m in section.motions.values()]
     checks.overlap(names, chains, config.timing.max_offset)
     found = timing.estimate(chains, names, config.timing)
