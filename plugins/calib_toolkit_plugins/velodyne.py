@@ -75,7 +75,8 @@ def deskew(points: Array, times: Array, velocity: Array) -> Array:
     """Points, each as measured, moved to where the scanner was at the stamp (paper V-A).
 
     points: (n, 3) metres. times: (n,) seconds from the stamp. velocity: (6,) of ``vec`` per second. The rotation
-    is taken to second order in the angle turned since the stamp: under a millimetre at 50 m and 20 degrees/s.
+    is taken to second order in the angle turned since the stamp: under a millimetre at 50 m and 20 degrees/s. The
+    path is taken as straight, which in a bend moves all points of a sweep by some millimetres sideways.
     """
     W = se3.skew(velocity[3:])
     t = times[:, None]

@@ -148,6 +148,13 @@ def damaged(change):
         damaged(lambda d: d["sensors"]["ins"]["sigma"].pop("dt")),
         damaged(lambda d: d["sensors"]["ins"].update(T_base_sensor=[[1, 2], [3, 4]])),
         damaged(lambda d: d["sensors"]["ins"].update(T_base_sensor="x")),
+        damaged(
+            lambda d: d["sensors"]["ins"].update(
+                T_base_sensor=np.array(d["sensors"]["ins"]["T_base_sensor"]).T.tolist()
+            )
+        ),
+        damaged(lambda d: d["sensors"]["ins"].update(clock_skew=float("nan"))),
+        damaged(lambda d: d["sensors"]["ins"].update(t_ref=99.0)),
         damaged(lambda d: d["sensors"]["ins"].update(T_base_sensor=np.diag([1.0, 1.0, -1.0, 1.0]).tolist())),
         damaged(lambda d: d["sensors"]["ins"].update(T_base_sensor=[[None, 0, 0, 0], *np.eye(4)[1:].tolist()])),
         damaged(lambda d: d["covariance"].update(matrix=[[1.0]])),

@@ -260,3 +260,19 @@ def test_sigma_is_nan_where_the_drive_determines_nothing():
 
 def test_clocks_run_true_until_estimated():
     assert_allclose(some_calibration().clock_skew, np.zeros(3))
+
+
+def test_clocks_that_drift_are_apart_by_more_later():
+    two = Calibration(
+        "a",
+        ("a", "b"),
+        np.array([np.eye(4)] * 2),
+        np.array([0.0, 0.02]),
+        np.zeros((14, 14)),
+        np.array([True, True]),
+        np.ones((2, 7), dtype=bool),
+        clock_skew=np.array([0.0, 1e-3]),
+        t_ref=10.0,
+    )
+    assert two.dt_at("a", "b", 60.0) == pytest.approx(0.07)
+    assert two.dt_at("b", "a", 60.0) == pytest.approx(-0.07)

@@ -193,3 +193,14 @@ def test_nothing_stands_in_the_way_of_a_long_drive():
     for seed in (1, 2, 3):
         true, ground = path(200.0, seed, "street"), terrain(seed, "street")
         test_nothing_stands_in_the_way(("street", true, ground, build(true, ground, "street", seed)))
+
+
+def test_scattered_rays_meet_what_moves_as_a_single_ray_does():
+    true = path(15.0, 4)
+    world = build(true, terrain(4, "street"), "street", 4)
+    mover = next(m for m in world.movers if m.end - m.start > 4.0)
+    stamp = mover.start + 2.0
+    below = mover.at(np.array([stamp]))[0, :3] + np.array([0.0, 0.0, 0.05])
+    origins, up = below + np.array([[0.0, 0.0, 0.0], [300.0, 0.0, 30.0]]), np.array([[0.0, 0.0, 1.0]] * 2)
+    alone = world.cast(origins[:1], up[:1], np.full(1, stamp)).distance[0]
+    assert world.cast(origins, up, np.full(2, stamp)).distance[0] == alone < 2.5

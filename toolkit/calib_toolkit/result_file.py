@@ -84,7 +84,10 @@ def _calibration(d: dict[str, Any]) -> Calibration:
     n, order = len(names), [f"{name}.{p}" for name in d["sensors"] for p in PARAMETERS]
     poses = np.array([s["T_base_sensor"] for s in sensors], dtype=float)
     dt = np.array([s.get("dt_base_sensor") for s in sensors], dtype=float)
-    covariance = d.get("covariance") or {"order": order, "matrix": np.zeros((7 * n, 7 * n))}
+    sigma = np.array(
+        [[s["sigma"][p] for p in PARAMETERS] if "sigma" in s else [0.0] * 7 for s in sensors], dtype=float
+    )
+    covariance = d.get("covariance") or {"order": order, "matrix": np.diag(sigma.ravel() ** 2)}
     cov = np.array(covariance["matrix"], dtype=float)
     if d["base"] not in names or covariance["order"] != order:
         raise ValueError("its base or the order of its covariance does not fit its sensors")
@@ -93,9 +96,14 @@ def _calibration(d: dict[str, Any]) -> Calibration:
     R = poses[:, :3, :3]
     if not np.allclose(R @ np.swapaxes(R, 1, 2), np.eye(3), atol=1e-3) or not np.all(np.linalg.det(R) > 0):
         raise ValueError("the rotation of a T_base_sensor is not one")
+    if not np.allclose(poses[:, 3], [0, 0, 0, 1]):
+        raise ValueError("the last row of a T_base_sensor is not 0 0 0 1; is the matrix transposed?")
+    skew = np.array([s.get("clock_skew", 0.0) for s in sensors], dtype=float)
+    t_ref = {float(s.get("t_ref", 0.0)) for s in sensors}
+    if not np.all(np.isfinite(skew)) or len(t_ref) > 1 or not np.all(np.isfinite(list(t_ref))):
+        raise ValueError("clock_skew and t_ref must be numbers, and t_ref the same for all sensors")
     known = np.column_stack([np.isfinite(poses[:, :3, 3]), np.ones((n, 3), dtype=bool), np.isfinite(dt)])
-    sigma = [[s["sigma"][p] for p in PARAMETERS] if "sigma" in s else [0.0] * 7 for s in sensors]
-    known &= np.isfinite(np.array(sigma, dtype=float))
+    known &= np.isfinite(sigma)
     return Calibration(
         d["base"],
         names,
@@ -105,8 +113,8 @@ def _calibration(d: dict[str, Any]) -> Calibration:
         np.array([s.get("has_scale", True) for s in sensors], dtype=bool),
         known,
         tuple(Undetermined(dict(u["direction"]), str(u["sentence"])) for u in d.get("undetermined", [])),
-        np.array([s.get("clock_skew", 0.0) for s in sensors], dtype=float),
-        float(sensors[0].get("t_ref", 0.0)),
+        skew,
+        t_ref.pop(),
     )
 
 

@@ -141,7 +141,7 @@ class _Bundle:
         ball = solid.radius + float(np.linalg.norm(ends[1] - ends[0])) / 2
         way = ends.mean(axis=0) - self._from
         away = float(np.linalg.norm(way))
-        if away > FARTHEST:
+        if away > FARTHEST + self._spread:
             return np.zeros(0, dtype=np.int64)
         centre = way.astype(np.float32)
         if self._spread > SCATTERED:

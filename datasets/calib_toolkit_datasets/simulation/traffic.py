@@ -14,6 +14,8 @@ TICK = 0.1
 """Seconds between the poses of a moving thing; between them it moves straight on."""
 VISIBLE = 130.0
 """Metres from the vehicle beyond which nothing moves."""
+SUDDEN = 40.0
+"""Metres from the vehicle within which no car comes or goes."""
 PEDESTRIANS = 4
 
 
@@ -83,7 +85,9 @@ class _Drive:
         if walks and self.site.ground.kerb:
             there &= self.site.roads.distance(np.column_stack([x, y])) > self.site.ground.edge + 0.4
         first, last = _longest(there)
-        if last - first < 2.0 / TICK:
+        away = np.hypot(*self._beside(np.column_stack([x, y])))
+        seen = [k for k in (first, last - 1) if 0 < k < len(s) - 1 and away[k] < SUDDEN]
+        if last - first < 2.0 / TICK or (seen and not walks):
             return None
         alive = slice(first, last)
         z = self.site.ground.height(np.column_stack([x, y])[alive])

@@ -57,9 +57,11 @@ def run(
     file = _writable(out) if out else None
     with bars() as progress:
         result = calibrate(log, config, installed, progress)
-    show_result(result, Console(highlight=False), log.reference)
     if file is not None:
         write_result(result, file)
+    span = log.trim(config.start, config.duration).span
+    show_result(result, Console(highlight=False), log.reference, sum(span) / 2)
+    if file is not None:
         click.echo(f"written: {file}")
     if not result.complete:
         ctx.exit(3)

@@ -20,8 +20,11 @@ NOISY = 1.5
 DIGITS = (3, 3, 3, 2, 2, 2, 2)
 
 
-def show_result(result: Result, console: Console, reference: Calibration | None = None) -> None:
-    """Print the calibration, what was not determined and the warnings; beside a reference, if there is one."""
+def show_result(result: Result, console: Console, reference: Calibration | None = None, middle: float = 0.0) -> None:
+    """Print the calibration, what was not determined and the warnings; beside a reference, if there is one.
+
+    middle: stamp of the middle of the drive, at which a reference whose clocks drift is shown.
+    """
     c = result.calibration
     console.print(f"\nPose of each sensor in {escape(c.base)} (maps its points to {escape(c.base)}), one sigma:")
     table = Table("sensor", "", box=SIMPLE, padding=(0, 1, 0, 0))
@@ -32,7 +35,7 @@ def show_result(result: Result, console: Console, reference: Calibration | None 
         table.add_row(escape(name), "estimate", *_cells(values))
         table.add_row("", "sigma", *_cells(sigma))
         if reference is not None and {name, c.base} <= set(reference.names):
-            there = _rebased(reference, c.base, name)
+            there = _rebased(reference, c.base, name, middle)
             table.add_row("", "reference", *_cells(there))
             table.add_row("", "difference", *_cells(_difference(values, there)), end_section=True)
     console.print(table)
@@ -73,10 +76,10 @@ def _euler(R: Array) -> Array:
     return Rotation.from_matrix(R).as_euler("ZYX")[::-1]
 
 
-def _rebased(reference: Calibration, base: str, name: str) -> Array:
+def _rebased(reference: Calibration, base: str, name: str, middle: float) -> Array:
     T = reference.between(base, name).T_a_b
     timed = reference.determined[[reference.index(base), reference.index(name)], 6].all()
-    dt = reference.dt_between(base, name)[0] if timed else np.nan
+    dt = reference.dt_at(base, name, middle) if timed else np.nan
     return np.concatenate([T[:3, 3], np.degrees(_euler(T[:3, :3])), [1e3 * dt]])
 
 

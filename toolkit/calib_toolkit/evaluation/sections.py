@@ -68,8 +68,9 @@ def cut(draw: Draw, drives: Sequence[Drive], protocol: str, seed: int) -> Sectio
         name: m[(m.start >= first) & (m.end <= first + draw.seconds)].shifted(d)
         for (name, m), d in zip(drive.motions.items(), moved, strict=True)
     }
-    gained = drive.truth.clock_skew * (first + draw.seconds / 2 - drive.truth.t_ref)
-    truth = replace(drive.truth, dt_base_sensor=drive.truth.dt_base_sensor + gained - moved)
+    told, middle = drive.truth, first + draw.seconds / 2
+    dt = np.array([told.dt_at(told.base, name, middle) for name in told.names])
+    truth = replace(told, dt_base_sensor=dt - moved)
     return Section(start, parts, drive.clocks, truth)
 
 

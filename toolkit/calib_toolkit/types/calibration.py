@@ -89,6 +89,11 @@ class Calibration:
         known = bool(np.all(self.determined[[i, j], :3]))
         return Transform(a, b, se3.relative(T_w_a, T_w_b), cov, known)
 
+    def dt_at(self, a: str, b: str, stamp: float) -> float:
+        """``dt_a_b`` at a stamp, seconds: where clocks run at different speeds it changes with time."""
+        i, j = self.index(a), self.index(b)
+        return self.dt_between(a, b)[0] + float(self.clock_skew[j] - self.clock_skew[i]) * (stamp - self.t_ref)
+
     def dt_between(self, a: str, b: str) -> tuple[float, float]:
         """``dt_a_b`` (added to b's stamps to get a's time) and its sigma, seconds."""
         i, j = self.index(a), self.index(b)

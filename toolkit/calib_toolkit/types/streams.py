@@ -117,6 +117,12 @@ class Log:
             raise DataError(f"sensor '{doubled[0]}' is named twice in the list of sensors; name it once")
         return replace(self, streams={name: self.streams[name] for name in names})
 
+    @property
+    def span(self) -> tuple[float, float]:
+        """First and last stamp of any sensor, seconds; zeros where there is none."""
+        stamps = [s.stamps for s in self.streams.values() if len(s)]
+        return min((float(s[0]) for s in stamps), default=0.0), max((float(s[-1]) for s in stamps), default=0.0)
+
     def trim(self, start: float = 0.0, duration: float | None = None) -> "Log":
         """The part from ``start`` seconds after the first stamp of any sensor, ``duration`` seconds long.
 
@@ -124,9 +130,8 @@ class Log:
         """
         if not self.streams or (start == 0.0 and duration is None):
             return self
-        stamps = [s.stamps for s in self.streams.values() if len(s)]
-        t0 = min((s[0] for s in stamps), default=0.0) + start
-        last = max((s[-1] for s in stamps), default=0.0)
+        t0, last = self.span
+        t0 += start
         if t0 >= last:
             raise DataError(f"{self.source} is {last - t0 + start:.1f} s long, so nothing is left after {start:g} s")
         t1 = np.inf if duration is None else t0 + duration
