@@ -6,6 +6,7 @@ says; it is inverted here, with its variances. Row 0 is a placeholder.
 
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,14 +38,21 @@ def matches(path: Path) -> bool:
 
 
 def open_log(path: Path, context: ReadContext) -> Log:
-    """Sensors ``velo``, ``ins`` and, in the order of their numbers, ``cam0``, ``cam1``, ... Raises DataError."""
+    """Sensors ``velo``, ``ins`` and, in the order of their numbers, ``cam0``, ``cam1``, ...
+
+    Cameras with identical stamps, the heads of a ladybug, were stamped by one trigger and share its clock.
+    Raises DataError.
+    """
     files = _files(path)
     contents = {name: _table(name, file) for name, file in files.items()}
     epoch_ns = min(int(ns[0]) for ns, _, _, _ in contents.values())
-    streams = {}
+    streams: dict[str, Stream] = {}
     for name, (ns, readings, intrinsics, notes) in contents.items():
         times, scaled = tables.seconds(ns, epoch_ns), not name.startswith("cam")
-        streams[name] = Stream(name, "odometry", times, readings, intrinsics, has_scale=scaled, notes=notes)
+        stream = Stream(name, "odometry", times, readings, intrinsics, has_scale=scaled, notes=notes)
+        cameras = [] if scaled else [s for s in streams.values() if not s.has_scale]
+        clocks = [s.clock for s in cameras if np.array_equal(s.stamps, times)]
+        streams[name] = replace(stream, clock=clocks[0]) if clocks else stream
     return Log(path, streams, epoch_ns)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_toolkit import Calibration, DataError, Dataset, Log, MotionReading, ReadContext, Stream, hookimpl, se3
-from calib_toolkit_datasets.simulation.vehicle import GRID, TruePath, path
+from calib_toolkit_datasets.simulation.vehicle import GRID, MARGIN, TruePath, path
 
 Array = NDArray[np.float64]
 
@@ -55,7 +55,7 @@ class SimulatedSensor:
 def measure(true: TruePath, sensor: SimulatedSensor, seed: int) -> Stream:
     """What the sensor makes of the drive: stamped motions with noise, as an ``odometry`` stream."""
     rng = np.random.default_rng([seed, *sensor.name.encode()])
-    first, last = true.stamps[0] + 2.0, true.stamps[-1] - 2.0
+    first, last = true.stamps[0] + MARGIN, true.stamps[-1] - MARGIN
     at = np.arange(first + rng.uniform(0, 1 / sensor.rate), last, 1 / sensor.rate)
     poses = true.at(at) @ sensor.T_vehicle_sensor
     vec = se3.vector(se3.relative(poses[:-1], poses[1:]))

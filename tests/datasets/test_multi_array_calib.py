@@ -100,6 +100,18 @@ def test_cameras_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     assert (intrinsics.K.shape, intrinsics.size, intrinsics.mask.shape) == ((3, 3), (120, 100), (100, 120))
 
 
+def test_cameras_of_one_trigger_share_a_clock(tmp_path: Path) -> None:
+    for number, late in ((1, 0), (2, 0), (3, 7), (4, 7)):
+        times = START_US + late + STEP_US * np.arange(4, dtype=np.uint64)
+        write(tmp_path, f"TestCam{number}", f"cam{number}Data", motions(4), time=times)
+    write(tmp_path, "TestNav", "navData", motions(4))
+    write(tmp_path, "TestVel", "velData", motions(4))
+    clocks = {n: s.clock for n, s in opened(tmp_path).streams.items()}
+    assert [clocks[f"cam{i}"] for i in range(4)] == ["cam0", "cam0", "cam2", "cam2"]
+    # the same stamps, and no trigger that is known of
+    assert (clocks["velo"], clocks["ins"]) == ("velo", "ins")
+
+
 @pytest.mark.parametrize(("value", "column"), [(1000.0, 4), (np.nan, 0), (0.0, 2)])
 def test_rows_that_failed_hold_no_motion(tmp_path: Path, value: float, column: int) -> None:
     variance = np.full((6, 6), 1e-4)
@@ -171,6 +183,7 @@ def test_the_authors_recordings(recordings: Path, folder: str, counts: dict[str,
         assert len(motion) > 0.95 * len(stream)
         assert np.all(np.linalg.eigvalsh(cov) > 0)
         if not stream.has_scale:
+            assert stream.clock == ("cam0" if folder == "shrimp" else stream.name)  # one ladybug, four cameras
             assert np.linalg.norm(motion[:, :3], axis=1) == pytest.approx(1.0)
 
 

@@ -12,9 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy.spatial.transform import Rotation
 
-from calib_toolkit import cli, open_log
+from calib_toolkit import cli, open_log, se3
 from calib_toolkit.result_file import calibration_dict
+from calib_toolkit_datasets.simulation.vehicle import path
 
 RIG = """
 seconds = {seconds}
@@ -149,6 +151,44 @@ def test_a_drive_that_tells_nothing_is_rows_of_refusals(tmp_path):
     assert "4 rows, 4 of them refused" in printed
 
 
+@pytest.fixture
+def posed(tmp_path):
+    """Two sensors' poses at the same stamps, with a truth; one pose of the second is not a number."""
+    true, mount = path(40.0, 5, "rough"), se3.rigid(np.eye(3), np.array([0.5, -0.3, 0.2]))
+    stamps = np.arange(0.0, 40.0, 0.1)
+    rng = np.random.default_rng(1)
+    for name, T in (("a", np.eye(4)), ("b", mount)):
+        poses = true.at(stamps) @ T
+        xyz = poses[:, :3, 3] + rng.normal(scale=1e-3, size=(len(stamps), 3))
+        rows = np.column_stack([stamps, xyz, Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
+        rows[100, 1] = np.nan if name == "b" else rows[100, 1]
+        np.savetxt(tmp_path / f"{name}.txt", rows)
+    table = '[sensors.{0}]\nkind = "odometry"\nposes = "{0}.txt"\nformat = "tum"\n'
+    (tmp_path / "rig.toml").write_text(table.format("a") + table.format("b"))
+    sensors = {n: {"T_base_sensor": T.tolist(), "dt_base_sensor": 0.0} for n, T in (("a", np.eye(4)), ("b", mount))}
+    (tmp_path / "truth.json").write_text(json.dumps({"base": "a", "sensors": sensors}))
+    return tmp_path
+
+
+def test_readings_that_were_left_out_are_told(posed):
+    out = posed / "out"
+    printed = evaluate("pair", posed, "-o", out, "--repeats", 1, "--seconds", 20, "--jobs", 1)
+    summary = (out / "pair.md").read_text()
+    for text in (printed, summary[summary.index("## Left out") :]):
+        assert f"{posed.name}: " in text
+        assert "b.txt" in text
+
+
+def test_equal_stamps_are_no_reason_to_share_a_clock(posed):
+    """The offset is estimated, as ``run`` does; only a reader knows which sensors are triggered together."""
+    rows = np.loadtxt(posed / "b.txt")
+    rows[100, 1] = rows[99:102:2, 1].mean()
+    np.savetxt(posed / "b.txt", rows)
+    out = posed / "out"
+    evaluate("pair", posed, "-o", out, "--repeats", 1, "--seconds", 20, "--jobs", 1)
+    assert float(rows_of(out / "pair.csv")[0]["sigma_dt_ms"]) > 0
+
+
 # ---- once, and the same whatever happens
 
 
@@ -231,7 +271,7 @@ def test_experiments_on_appearance_are_refused(drive, tmp_path, name):
             ("pair", "--sensors", "velo,ins,cam0"),
             "'pair' compares two sensors, and these are velo, ins, cam0; name two",
         ),
-        (("pair", "--sensors", "velo"), "calibrating takes at least two sensors"),
+        (("pair", "--sensors", "velo"), "comparing takes at least two sensors, and this is velo"),
         (("pair", "--sensors", "velo,sonar"), "has no sensor named 'sonar'; it has: cam0, cam1, velo, ins"),
         (("timing", "--baseline"), "--baseline does not go with 'timing'"),
         (("pair", "--seconds", "500"), "no recording lasts long enough: 500 s: longer than first (44."),
@@ -246,9 +286,47 @@ def test_one_drive_twice_is_refused(drive, tmp_path):
     assert "is named twice" in refused("pair", drive, drive, "-o", tmp_path / "out")
 
 
-@pytest.mark.parametrize("seconds", ["a", "10,10", "0.5", "nan", "inf"])
+@pytest.mark.parametrize("seconds", ["a", "10,10", "20.00001,20.00002", "0.5", "nan", "inf"])
 def test_lengths_are_numbers(drive, tmp_path, seconds):
     assert "--seconds" in evaluate("pair", drive, "-o", tmp_path / "out", "--seconds", seconds, status=2)
+
+
+def test_no_sensor_is_wrong_usage(drive, tmp_path):
+    assert "no sensor is named" in evaluate("pair", drive, "-o", tmp_path / "out", "--sensors", ",", status=2)
+
+
+@pytest.fixture
+def nothing_dear(monkeypatch):
+    """Fails as soon as a sensor's motion is estimated."""
+    from calib_toolkit.evaluation import drives
+
+    monkeypatch.setattr(drives, "sensor_motions", lambda *_: pytest.fail("estimated before it was refused"))
+
+
+@pytest.mark.parametrize("arguments", [("pair", "--sensors", "velo,ins,cam0"), ("timing", "--baseline"), ("pair",)])
+def test_what_is_cheap_is_refused_before_anything_dear(drive, tmp_path, arguments, nothing_dear):
+    (tmp_path / "file").write_text("")
+    assert refused(*arguments, drive, "-o", tmp_path / "file" / "out")
+
+
+def test_drives_of_other_sensors_are_refused_before_anything_dear(drive, no_truth, tmp_path, nothing_dear):
+    rig, truth = no_truth
+    (tmp_path / "t.json").write_text(json.dumps(calibration_dict(truth)))
+    arguments = ("timing", drive, rig, "-o", tmp_path / "out", "--truth", tmp_path / "t.json")
+    assert "has no camera" in refused(*arguments)
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_failed_unexpectedly_is_told_by_the_exit_status(drive, tmp_path, monkeypatch):
+    from calib_toolkit.evaluation import measures
+
+    def failing(*_):
+        raise ValueError("array must not contain infs")
+
+    monkeypatch.setattr(measures, "calibrate_motions", failing)
+    arguments = ("pair", drive, "-o", tmp_path, "--repeats", 1, "--seconds", 20, "--jobs", 1)
+    assert "2 rows failed unexpectedly" in evaluate(*arguments, status=3)
+    assert "1 x paper: unexpected ValueError: array must not contain infs" in (tmp_path / "pair.md").read_text()
 
 
 def test_a_folder_that_takes_nothing_is_refused(drive, tmp_path):

@@ -1,10 +1,14 @@
 """``calib-toolkit evaluate``: the paper's experiments on drives whose truth is known."""
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import click
+
+if TYPE_CHECKING:
+    from calib_toolkit.types import Calibration
 
 NAMES = ("timing", "pair", "panoramic", "appearance", "full")
 LEFT_TO_THE_FILE = ("mean", "RMS", "sigma", "sections", "no truth", "paper")
@@ -27,11 +31,16 @@ LEFT_TO_THE_FILE = ("mean", "RMS", "sigma", "sections", "no truth", "paper")
     "--repeats", type=click.IntRange(min=1), default=100, show_default=True, help="Sections of each length."
 )
 @click.option("--seconds", metavar="A,B,...", help="Lengths of the sections; the paper's by default.")
-@click.option("--baseline", is_flag=True, help="Run least squares and OpenCV's hand-eye calibration beside.")
+@click.option(
+    "--baseline", is_flag=True, help="Other methods beside: OpenCV's for 'pair', least squares for 'panoramic'."
+)
 @click.option("--method", type=click.Choice(["paper"]), default="paper", show_default=True, help="Estimator.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Processes; one for each core by default.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the sections.")
+@click.pass_context
 def evaluate(
+    ctx: click.Context,
+    /,
     protocol: str,
     drives: tuple[Path, ...],
     out: Path,
@@ -48,13 +57,14 @@ def evaluate(
 
     PROTOCOL is timing (clock offsets), pair (two sensors), panoramic (a ring of cameras), appearance or full. Writes
     a table, a summary and a figure to the folder; the same command goes on where a killed one stopped. Exit status 0
-    when every repeat has its rows, refused ones included; 1 when nothing can be compared, with the reason.
+    when every repeat has its rows, refused ones included; 3 when some failed in a way that nobody foresaw; 1 when
+    nothing can be compared, with the reason; 2 for wrong usage.
     """
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(variable, "1")  # the processes are the parallelism
     from calib_toolkit.cli.bars import bars
     from calib_toolkit.config import Config
-    from calib_toolkit.evaluation import experiment, figures, panorama, summary
+    from calib_toolkit.evaluation import experiment, figures, panorama, store, summary
     from calib_toolkit.evaluation.drives import open_drives
     from calib_toolkit.evaluation.errors import UNITS
     from calib_toolkit.evaluation.protocols import protocol as named
@@ -65,15 +75,21 @@ def evaluate(
     config = Config(method=method, seed=seed, jobs=jobs or os.cpu_count() or 1)
     known = read_calibration(truth) if truth else None
     names = _names(sensors)
+    choices = experiment.Choices(repeats, lengths, baseline)
+    chosen.estimators(method, baseline)  # refuses what does not go together
+
+    def check(truths: "Mapping[str, Calibration]") -> None:
+        experiment.check(chosen, truths)
+        store.writable(out)
+
     with bars() as progress:
-        opened = open_drives(drives, (lambda _: names) if names else chosen.choose, known, config, progress)
-        choices = experiment.Choices(repeats, lengths, baseline)
+        opened = open_drives(drives, (lambda _: names) if names else chosen.choose, known, check, config, progress)
         done = experiment.run(protocol, opened, out, choices, config, progress)
-    notes = experiment.notes(protocol, choices)
+    notes = [f"{d.name}: {note}" for d in opened for note in d.notes] + experiment.notes(protocol, choices)
     if protocol == "panoramic":
         notes.append(panorama.draw(opened[0], done.rows, out / "panorama.png"))
     figures.draw(protocol, done.rows, out / f"{protocol}.png")
-    (out / f"{protocol}.md").write_text(summary.markdown(protocol, done.rows, done.skipped, notes), encoding="utf-8")
+    (out / f"{protocol}.md").write_text(summary.markdown(protocol, done, notes), encoding="utf-8")
     for parameter in chosen.short:
         _show(f"{parameter}, {UNITS[parameter]}", summary.table(protocol, done.rows, parameter))
     refused = sum(row["status"] == "refused" for row in done.rows)
@@ -81,6 +97,9 @@ def evaluate(
     for note in (*done.skipped, *notes):
         click.echo(note)
     click.echo(f"written: {', '.join(str(out / f'{protocol}.{end}') for end in ('csv', 'md', 'png'))}")
+    if failed := sum(row["note"].startswith(experiment.UNEXPECTED) for row in done.rows):
+        click.echo(f"{failed} rows failed unexpectedly, a fault of this program: see the table's notes", err=True)
+        ctx.exit(3)
 
 
 def _show(title: str, lines: list[list[str]]) -> None:
@@ -101,7 +120,10 @@ def _show(title: str, lines: list[list[str]]) -> None:
 
 
 def _names(sensors: str | None) -> list[str]:
-    return [n.strip() for n in (sensors or "").split(",") if n.strip()]
+    names = [n.strip() for n in (sensors or "").split(",") if n.strip()]
+    if sensors is not None and not names:
+        raise click.BadParameter("no sensor is named", param_hint="--sensors")
+    return names
 
 
 def _lengths(seconds: str | None) -> tuple[float, ...]:
@@ -111,6 +133,8 @@ def _lengths(seconds: str | None) -> tuple[float, ...]:
         raise click.BadParameter(f"{seconds!r} is not a list of numbers", param_hint="--seconds") from e
     if seconds is not None and not lengths:
         raise click.BadParameter("no length is given", param_hint="--seconds")
-    if not all(1.0 <= s < float("inf") for s in lengths) or len(set(lengths)) < len(lengths):
-        raise click.BadParameter("each length is at least one second, and given once", param_hint="--seconds")
+    if not all(1.0 <= s < float("inf") for s in lengths) or len({f"{s:g}" for s in lengths}) < len(lengths):
+        raise click.BadParameter(
+            "each length is at least one second, and given once (to six digits)", param_hint="--seconds"
+        )
     return lengths

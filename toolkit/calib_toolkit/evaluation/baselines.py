@@ -22,7 +22,8 @@ POSES = 200
 def least_squares(steps: Steps) -> Array:
     """``T_a_b`` (4, 4) of steps of two sensors: Kabsch on the rotation vectors, then linear least squares (VIII-D).
 
-    Every step weighs the same and none is left out. The translation is nan unless both sensors have scale.
+    Every step weighs the same, but they are the paper's own: on its clock offsets, and without those that its gate
+    of ten sigma left out. The translation is nan unless both sensors have scale. Raises NotObservableError.
     """
     (w_a, w_b), (p_a, p_b) = steps.vec[..., 3:], steps.vec[..., :3]
     R = kabsch(w_a, w_b)
@@ -34,7 +35,9 @@ def least_squares(steps: Steps) -> Array:
 
 
 def kabsch(w_a: Array, w_b: Array) -> Array:
-    """The rotation (3, 3) that best takes vectors b (m, 3) to vectors a (m, 3)."""
+    """The rotation (3, 3) that best takes vectors b (m, 3) to vectors a (m, 3). Raises NotObservableError."""
+    if len(w_a) < 2:
+        raise NotObservableError(f"a rotation takes at least two common steps, and there are {len(w_a)}")
     U, _, Vt = np.linalg.svd(w_a.T @ w_b)
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 

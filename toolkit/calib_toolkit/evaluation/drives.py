@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True)
 class Drive:
     """One recording. motions: of the sensors compared, the base first. clocks: (n,) sensors that name the same clock
-    share it. truth: of these sensors, in that order.
+    share it. truth: of these sensors, in that order. notes: sentences on readings that were left out.
     """
 
     name: str
@@ -29,6 +29,7 @@ class Drive:
     motions: Mapping[str, Motions]
     clocks: tuple[str, ...]
     truth: Calibration
+    notes: tuple[str, ...] = ()
 
     @property
     def span(self) -> tuple[float, float]:
@@ -40,26 +41,34 @@ def open_drives(
     paths: Sequence[Path],
     choose: Callable[[Log], list[str]],
     truth: Calibration | None,
+    check: Callable[[Mapping[str, Calibration]], None],
     config: Config,
     progress: Progress,
 ) -> list[Drive]:
     """The recordings at the paths. choose: which sensors of a recording are compared. truth: of all recordings, or
-    None for what came with each. Raises DataError.
+    None for what came with each. check: raises if these recordings' truths, by name, can not be compared with; it
+    is asked before anything is estimated. Raises DataError.
     """
     plugins = registry()
-    drives = []
+    logs, truths = {}, {}
     for path, name in zip(paths, _labels(paths), strict=True):
-        log = open_log(path)
-        log = log.select(_base_first(log.select(choose(log))))
+        log = open_log(path, plugins=plugins)
+        logs[name] = log = log.select(_base_first(log.select(choose(log))))
         there = truth or log.reference
         if there is None:
             raise DataError(
                 f"{path} comes without a truth to compare with; give one with --truth FILE, in the form of a "
                 "calibration.json"
             )
-        known = rebased(there, tuple(log.streams), str(path))
+        truths[name] = rebased(there, tuple(log.streams), str(path))
+    check(truths)
+    drives = []
+    for name, log in logs.items():
         moved = sensor_motions(log, config, plugins, progress, default_folder())
-        drives.append(Drive(name, log, {n: moved[n].motions for n in log.streams}, _clocks(log), known))
+        motions = {n: moved[n].motions for n in log.streams}
+        clocks = tuple(s.clock for s in log.streams.values())
+        notes = (*log.notes, *(note for n, s in log.streams.items() for note in (*s.notes, *moved[n].notes)))
+        drives.append(Drive(name, log, motions, clocks, truths[name], notes))
     return drives
 
 
@@ -122,15 +131,6 @@ def _base_first(log: Log) -> list[str]:
     scaled = [s.name for s in log.streams.values() if s.has_scale]
     first = (scaled or list(log.streams))[0]
     return [first, *(n for n in log.streams if n != first)]
-
-
-def _clocks(log: Log) -> tuple[str, ...]:
-    """Each sensor's clock; those whose stamps are all the same were stamped by one trigger, and share it."""
-    streams = list(log.streams.values())
-    return tuple(
-        next(s.clock for s in streams if s.clock == stream.clock or np.array_equal(s.stamps, stream.stamps))
-        for stream in streams
-    )
 
 
 def _labels(paths: Sequence[Path]) -> list[str]:

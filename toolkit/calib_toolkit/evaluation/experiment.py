@@ -15,12 +15,15 @@ from calib_toolkit.evaluation import baselines
 from calib_toolkit.evaluation.drives import Drive
 from calib_toolkit.evaluation.errors import UNITS, Finding
 from calib_toolkit.evaluation.protocols import Protocol, protocol
-from calib_toolkit.evaluation.sections import Draw, Section, cut, plan
+from calib_toolkit.evaluation.sections import Draw, Section, cut, plan, side_by_side
 from calib_toolkit.evaluation.store import Row, Store
 from calib_toolkit.progress import Progress
+from calib_toolkit.types import Calibration
 
 DRAW = ("drive", "seconds", "spread", "repeat")
 FINDING = ("estimator", "sensor")
+UNEXPECTED = "unexpected"
+"""How the note begins of what should not have been refused, but made the program fail."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +37,14 @@ class Choices:
 
 @dataclass(frozen=True)
 class Outcome:
-    """rows: of the whole table, in the order of the plan. skipped: sentences on lengths that no drive lasts."""
+    """rows: of the whole table, in the order of the plan. skipped: sentences on lengths that no drive lasts.
+
+    apart: by length, how many of the sections there can be at most that do not overlap.
+    """
 
     rows: list[Row]
     skipped: list[str]
+    apart: Mapping[float, int]
 
 
 def run(
@@ -48,7 +55,7 @@ def run(
     Drives must have the same sensors. A repeat that is refused is a row that says so.
     """
     experiment = protocol(name)
-    _check(experiment, drives)
+    check(experiment, {d.name: d.truth for d in drives})
     draws, skipped = plan(drives, choices.seconds, experiment.spreads, choices.repeats)
     if not draws:
         raise DataError(
@@ -71,7 +78,31 @@ def run(
         progress.advance(name, 1)
     ordered = [row for d in draws for row in done[_key(d, drives)]]
     store.rewrite(ordered)
-    return Outcome(ordered, skipped)
+    apart = {s: min(choices.repeats, side_by_side(drives, s)) for s in dict.fromkeys(d.seconds for d in draws)}
+    return Outcome(ordered, skipped, apart)
+
+
+def check(experiment: Protocol, truths: Mapping[str, Calibration]) -> None:
+    """Refuse recordings that can not be compared, told by their names and truths. Raises DataError."""
+    first, told = next(iter(truths.items()))
+    if len(told.names) < 2:
+        raise DataError(f"{first}: comparing takes at least two sensors, and this is {told.names[0]}; name more")
+    experiment.labels(told.names)
+    for name, truth in truths.items():
+        if truth.names != told.names:
+            raise DataError(
+                f"{name} has {', '.join(truth.names)} where {first} has {', '.join(told.names)}; "
+                "drives of one experiment have the same sensors: choose them with --sensors"
+            )
+        clocks = experiment.needs == "clocks"
+        known = truth.determined[1:, 6 if clocks else 3]
+        # sensors whose clock nobody knows may run along; a rotation is what the others are told against
+        if not (known.any() if clocks else known.all()):
+            unknown = ", ".join(n for n, k in zip(truth.names[1:], known, strict=True) if not k)
+            raise DataError(
+                f"the truth of {name} does not say {'how late the clock is' if clocks else 'how it is turned'} of "
+                f"{unknown} against {truth.base}; leave it out with --sensors, or give another truth with --truth"
+            )
 
 
 def notes(name: str, choices: Choices) -> list[str]:
@@ -102,10 +133,15 @@ class _Work:
         try:
             findings = experiment.measure(section, self.config, list(self.estimators))
         except CalibrationError as e:
-            findings = [Finding(m, label, refused=str(e)) for m in self.estimators for label in self.labels]
+            findings = self._refused(str(e))
+        except (ValueError, ArithmeticError) as e:  # one bad section must not cost all the others
+            findings = self._refused(f"{UNEXPECTED} {type(e).__name__}: {e}")
         drawn = (drive, f"{draw.seconds:g}", f"{draw.spread:g}", str(draw.repeat), f"{section.start:.3f}")
         start = dict(zip((*DRAW, "start"), drawn, strict=True))
         return draw, [start | _row(f, columns(experiment)) for f in findings]
+
+    def _refused(self, sentence: str) -> list[Finding]:
+        return [Finding(m, label, refused=sentence) for m in self.estimators for label in self.labels]
 
 
 def _row(f: Finding, titles: Sequence[str]) -> dict[str, str]:
@@ -135,24 +171,6 @@ def _key(d: Draw, drives: Sequence[Drive]) -> tuple[str, ...]:
     return drives[d.drive].name, f"{d.seconds:g}", f"{d.spread:g}", str(d.repeat)
 
 
-def _check(experiment: Protocol, drives: Sequence[Drive]) -> None:
-    for d in drives:
-        if tuple(d.motions) != tuple(drives[0].motions):
-            raise DataError(
-                f"{d.name} has {', '.join(d.motions)} where {drives[0].name} has {', '.join(drives[0].motions)}; "
-                "drives of one experiment have the same sensors: choose them with --sensors"
-            )
-        clocks = experiment.needs == "clocks"
-        known = d.truth.determined[1:, 6 if clocks else 3]
-        # sensors whose clock nobody knows may run along; a rotation is what the others are told against
-        if not (known.any() if clocks else known.all()):
-            unknown = ", ".join(n for n, k in zip(list(d.motions)[1:], known, strict=True) if not k)
-            raise DataError(
-                f"the truth of {d.name} does not say {'how late the clock is' if clocks else 'how it is turned'} of "
-                f"{unknown} against {d.truth.base}; leave it out with --sensors, or give another truth with --truth"
-            )
-
-
 def _settings(
     name: str, drives: Sequence[Drive], choices: Choices, config: Config, estimators: Sequence[str]
 ) -> dict[str, Any]:
@@ -165,12 +183,12 @@ def _settings(
     truths = [
         (t.T_base_sensor, t.dt_base_sensor, t.clock_skew, t.t_ref, t.determined) for t in (d.truth for d in drives)
     ]
-    data = cache.key_of([[d.motions, d.clocks, *told] for d, told in zip(drives, truths, strict=True)])
     return {
         "protocol": name,
         "drives": [d.name for d in drives],
         "sensors": list(drives[0].motions),
-        "data": data,
+        "motions": cache.key_of([[d.motions, d.clocks] for d in drives]),
+        "truth": cache.key_of(truths),
         "seconds": list(choices.seconds),
         "repeats": choices.repeats,
         "seed": config.seed,

@@ -1,6 +1,6 @@
 """The figures of section VIII in the paper's form, drawn from the table of an experiment."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from calib_toolkit.evaluation.errors import EULER, POSITION, UNITS
 from calib_toolkit.evaluation.store import Row
-from calib_toolkit.evaluation.summary import Statistics, groups, statistics
+from calib_toolkit.evaluation.summary import Statistics, Trial, groups, statistics, told_by_all, trial
 
 Array = NDArray[np.float64]
 
@@ -27,11 +27,12 @@ def draw(name: str, rows: Sequence[Row], file: Path) -> None:
 
 def _timing(figure: Any, rows: Sequence[Row]) -> None:
     """Box plots of the absolute error by length, a panel for each spread (Fig. 6)."""
+    compared = told_by_all(rows, "dt")
     spreads = sorted({float(r["spread"]) for r in rows})
     figure.set_size_inches(9.5, 3.6 * len(spreads))
     panels = figure.subplots(len(spreads), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     for panel, spread in zip(panels, spreads, strict=True):
-        some = [(s, statistics(g, "dt").error) for at, s, _, g in groups(rows) if at == spread]
+        some = [(s, statistics(g, "dt", compared).error) for at, s, _, g in groups(rows) if at == spread]
         _boxes(panel, [e for _, e in some], [f"{s:g}" for s, _ in some], OURS)
         panel.set_yscale("log")
         panel.set_ylim(bottom=0.01)
@@ -47,7 +48,9 @@ def _pair(figure: Any, rows: Sequence[Row]) -> None:
     estimators = list(dict.fromkeys(r["estimator"] for r in rows))
     panels = figure.subplots(2, 3, sharex=True).ravel()
     for panel, parameter in zip(panels, (*EULER, *POSITION), strict=True):
-        lines = {m: [(s, statistics(g, parameter)) for _, s, at, g in groups(rows) if at == m] for m in estimators}
+        compared = told_by_all(rows, parameter)
+        each = [(m, s, statistics(g, parameter, compared)) for _, s, m, g in groups(rows)]
+        lines = {m: [(s, found) for at, s, found in each if at == m] for m in estimators}
         _band(panel, lines[estimators[0]])
         styles = [("o", OURS), ("x", THEIRS), *(("+", c) for c in OTHERS)]
         top, beyond = _top(lines, estimators), 0
@@ -55,26 +58,31 @@ def _pair(figure: Any, rows: Sequence[Row]) -> None:
             told = [(s, float(found.error.mean())) for s, found in line if len(found.error)]
             beyond += sum(e > top for _, e in told)
             if told:
-                panel.plot(*zip(*told, strict=True), marker, color=color, label=method, fillstyle="none", zorder=3)
+                of = f"{method}, {_share([found for _, found in line])}"
+                panel.plot(*zip(*told, strict=True), marker, color=color, label=of, fillstyle="none", zorder=3)
         panel.set_title(parameter + (f" ({beyond} beyond the axis)" if beyond else ""), fontsize=10)
         panel.set_ylabel(f"mean absolute error, {UNITS[parameter]}")
         panel.set_ylim(0, top)
         panel.grid(alpha=0.3)
     for panel in panels[3:]:
         panel.set_xlabel("length of the section, s")
-    if panels[0].get_legend_handles_labels()[0]:
-        panels[0].legend(fontsize=8)
+    for panel in panels:  # each parameter is compared over other sections, so each panel says which
+        if panel.get_legend_handles_labels()[0]:
+            panel.legend(fontsize=7)
 
 
 def _panoramic(figure: Any, rows: Sequence[Row]) -> None:
     """Box plots of the mean error over all pairs of cameras, all together against each with the first (Fig. 8)."""
     figure.set_size_inches(10, 4)
     parameters = (*EULER, "rotation")
+    repeats = len({trial(r)[:4] for r in rows})
     short = {"together": "comb", "separate": "sep", "least-squares": "LS"}
     estimators = list(dict.fromkeys(r["estimator"] for r in rows))
     for panel, parameter in zip(figure.subplots(1, 4), parameters, strict=True):
-        each = [_by_repeat([r for r in rows if r["estimator"] == m], parameter) for m in estimators]
+        compared = told_by_all(rows, parameter)
+        each = [_by_repeat([r for r in rows if r["estimator"] == m], parameter, compared) for m in estimators]
         labels = [next((s for end, s in short.items() if m.endswith(end)), m) for m in estimators]
+        labels = [f"{label}\n{len(e)} of {repeats}" for label, e in zip(labels, each, strict=True)]
         _boxes(panel, each, labels, OURS)
         panel.set_title("total" if parameter == "rotation" else parameter, fontsize=10)
         panel.set_ylim(bottom=0)
@@ -112,12 +120,17 @@ def _top(lines: dict[str, list[tuple[float, Statistics]]], estimators: Sequence[
     return 1.1 * float(min(max(all_of_them), 3 * np.percentile(all_of_them, 75))) if all_of_them else 1.0
 
 
-def _by_repeat(rows: Sequence[Row], parameter: str) -> Array:
+def _share(found: Sequence[Statistics]) -> str:
+    """Over how many of the sections something is told."""
+    return f"{sum(len(f.error) for f in found)} of {sum(f.sections for f in found)}"
+
+
+def _by_repeat(rows: Sequence[Row], parameter: str, compared: Set[Trial]) -> Array:
     """(k,) mean absolute error over the pairs of each repeat for which all are known."""
-    repeats: dict[tuple[str, str, str], list[Row]] = {}
+    repeats: dict[tuple[str, ...], list[Row]] = {}
     for row in rows:
-        repeats.setdefault((row["drive"], row["seconds"], row["repeat"]), []).append(row)
-    found = [statistics(some, parameter) for some in repeats.values()]
+        repeats.setdefault(trial(row)[:4], []).append(row)
+    found = [statistics(some, parameter, compared) for some in repeats.values()]
     return np.array(
         [s.error.mean() for s, some in zip(found, repeats.values(), strict=True) if len(s.error) == len(some)]
     )

@@ -3,9 +3,6 @@
 PRINTED = {
     ("timing", "dt", 200.0, 1.0): "KITTI 6, worst 40; Shrimp 2, worst 9",
     ("pair", "rotation", 300.0, 0.0): "below 0.5 an axis on KITTI, below 2 on Shrimp",
-    ("appearance", "within 0.3 m and 2 deg", 100.0, 0.0): "NMI 84 %, GOM 89 %, Levinson 95 %, IM 100 % (Table I)",
-    ("appearance", "the same, unconstrained", 100.0, 0.0): "NMI 9 %, GOM 9 %, Levinson 13 %, IM 23 % (Table I)",
-    ("full", "mean error", 100.0, 0.0): "6.3, 7.5, 2.0 cm; 0.438, 0.415, 0.154 deg (Table II)",
 }
 """As printed, by protocol, parameter, seconds and spread; medians in the units of the tables unless they say more."""
 

@@ -57,6 +57,11 @@ def plan(
     return draws, skipped
 
 
+def side_by_side(drives: Sequence[Drive], seconds: float) -> int:
+    """How many sections of a length the drives hold at most of which no two overlap."""
+    return sum(int(_lasting(d) / seconds) for d in drives)
+
+
 def cut(draw: Draw, drives: Sequence[Drive], protocol: str, seed: int) -> Section:
     """The part that a draw stands for: a function of seed, protocol, length and repeat only, scaled by the spread."""
     drive = drives[draw.drive]

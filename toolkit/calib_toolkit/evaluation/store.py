@@ -9,11 +9,22 @@ import io
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 from calib_toolkit.errors import DataError
 
 Row = Mapping[str, str]
+
+
+def writable(folder: Path) -> None:
+    """Make the folder. Raises DataError if it can not take the results."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder):
+            return
+    except OSError as e:
+        raise DataError(f"{folder} can not take the results ({e.strerror or e}); choose another with -o") from e
 
 
 class Store:
@@ -22,11 +33,8 @@ class Store:
     def __init__(self, folder: Path, name: str, settings: Mapping[str, Any], columns: Sequence[str]) -> None:
         self.columns = tuple(columns)
         self.table, self.settings = folder / f"{name}.csv", folder / f"{name}.json"
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            self._agree(json.loads(json.dumps(settings)))
-        except OSError as e:
-            raise DataError(f"{folder} can not take the results ({e.strerror or e}); choose another with -o") from e
+        writable(folder)
+        self._agree(json.loads(json.dumps(settings)))
 
     def read(self) -> list[Row]:
         """The rows that are whole, as written."""
