@@ -81,6 +81,8 @@ class Errors:
             ((x - x.mean(axis=0)) * weight).ravel() for x in (self.error[self.usual], self.rate[self.usual])
         )
         information = float(rate @ rate)
+        if information <= 1e-12 * len(self.error):  # nothing changes, so nothing can be late
+            return float("nan"), float("nan")
         dt = -float(rate @ error) / information
         return dt, float(np.std(error + dt * rate) / np.sqrt(information))
 

@@ -82,7 +82,7 @@ def _panoramic(figure: Any, rows: Sequence[Row]) -> None:
         compared = told_by_all(rows, parameter)
         each = [_by_repeat([r for r in rows if r["estimator"] == m], parameter, compared) for m in estimators]
         labels = [next((s for end, s in short.items() if m.endswith(end)), m) for m in estimators]
-        labels = [f"{label}\n{len(e)} of {repeats}" for label, e in zip(labels, each, strict=True)]
+        labels = [f"{label}\n{len(e)}/{repeats}" for label, e in zip(labels, each, strict=True)]
         _boxes(panel, each, labels, OURS)
         panel.set_title("total" if parameter == "rotation" else parameter, fontsize=10)
         panel.set_ylim(bottom=0)
