@@ -267,8 +267,8 @@ def test_a_full_disk_is_foreseen(monkeypatch, tmp_path):
         ({"drive": "moon"}, "there is no drive called 'moon'"),
         ({"scene": "moon"}, "there is no scene called 'moon'"),
         ({"layout": "folders"}, "there is no layout of a kitti called 'folders'"),
-        ({"seconds": 0.1}, "from 1 to 7200 seconds"),
-        ({"seconds": float("nan")}, "from 1 to 7200 seconds"),
+        ({"seconds": 0.1}, "from 1 to 1800 seconds"),
+        ({"seconds": float("nan")}, "from 1 to 1800 seconds"),
         ({"seed": -1}, "a seed is 0 or more"),
     ],
 )
