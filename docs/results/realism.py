@@ -173,7 +173,8 @@ class Drive:
         T = se3.invert(self.poses(np.array([base])) @ T_velo_cam @ se3.matrix([0, 0, 0, 0, off, 0]))[0]
         seen, zero = self.sweep(nearest)[1] @ T[:3, :3].T + T[:3, 3], np.zeros(3)
         lens = camera.intrinsics
-        assert lens is not None and lens.size is not None  # noqa: PT018
+        assert lens is not None
+        assert lens.size is not None
         width, height = lens.size
         rim = np.array([[x, y] for x in (0, width / 2, width) for y in (0, height / 2, height)])
         corners = cv2.undistortPoints(rim[:, None], lens.K, lens.distortion)[:, 0]
