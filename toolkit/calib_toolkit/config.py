@@ -13,6 +13,7 @@ from calib_toolkit.errors import ConfigError
 from calib_toolkit.rotation import RotationOptions
 from calib_toolkit.timing import TimingOptions
 from calib_toolkit.translation import TranslationOptions
+from calib_toolkit.types import Measured
 
 METHODS = ("paper",)
 TINY = 1e-3
@@ -31,7 +32,7 @@ class Config:
 
     base: the sensor all poses are given in; None for the first that has scale. start, duration: the part of the
     drive to use, seconds from its first stamp. jobs: processes for the sensors' own motion. sensors: options of
-    the sensor plugins, by sensor name or kind.
+    the sensor plugins, by sensor name or kind. prior: numbers that were measured by hand.
     """
 
     method: str = "paper"
@@ -45,6 +46,7 @@ class Config:
     rotation: RotationOptions = field(default_factory=RotationOptions)
     translation: TranslationOptions = field(default_factory=TranslationOptions)
     sensors: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    prior: tuple[Measured, ...] = ()
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:

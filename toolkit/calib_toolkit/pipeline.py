@@ -1,26 +1,20 @@
-"""From a recorded drive to a calibrated rig: the paper's section IV, stage by stage."""
+"""From a recorded drive to a calibrated rig: each sensor's own motion, then all of them together."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-from calib_toolkit import assembly, cache, checks, observability, rotation, sync, timing, translation
+from calib_toolkit import cache, paper
 from calib_toolkit.config import Config
 from calib_toolkit.errors import ConfigError, DataError
 from calib_toolkit.estimation import SensorMotion, estimate_motions
 from calib_toolkit.plugins import Registry, registry
 from calib_toolkit.progress import Progress, Silent
 from calib_toolkit.result_file import read_calibration
-from calib_toolkit.types import Log, Motions, Result
+from calib_toolkit.types import Calibration, Log, Motions, Result
 
-Array = NDArray[np.float64]
-
-STAGES = "timing, rotation, translation"
-
-
+METHODS = {"paper": paper}
+"""The estimators: modules with ``calibrate`` and ``clock_offsets``."""
 TRUTH = "truth.json"
 """A calibration that may lie in a recording's folder, to compare with."""
 
@@ -76,57 +70,21 @@ def calibrate_motions(
     warnings: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Result:
-    """Timing, then rotation, then translation, over all sensors at once (section IV); the first is the base.
+    """The calibration that the sensors' motions tell, by the method chosen; the first sensor is the base.
 
     clocks: (n,) sensors that name the same clock share one offset; each its own if empty. Raises CalibrationError.
     """
-    config, progress = config or Config(), progress or Silent()
-    progress.begin(STAGES, 3)
-    names = tuple(motions)
-    checks.moved(motions)
-    chains = [sync.chain(m) for m in motions.values()]
-    checks.overlap(names, chains, config.timing.max_offset)
+    config = config or Config()
+    found = METHODS[config.method].calibrate(motions, config, clocks or tuple(motions), progress or Silent())
+    return replace(found, warnings=tuple(warnings), configuration=asdict(config))
 
-    clocks = clocks or names
-    offsets = timing.estimate(chains, clocks, config.timing)
-    unknown_times = observability.unmeasured_times(names, _on_base_clock(chains, offsets.dt), clocks)
-    offsets = timing.without(offsets, ~assembly.determined(names, unknown_times)[:, 6])
 
-    progress.advance(STAGES, 1)
-
-    steps = sync.synchronise(_on_base_clock(chains, offsets.dt), config.sync.gate)
-    checks.steps(steps)
-    checks.lengths(names, steps)
-    steps = sync.add_timing_noise(steps, offsets.cov)
-
-    rotations = rotation.estimate(steps, config.rotation)
-    unknown_turns = observability.unmeasured_turns(names, steps, rotations.R_base_sensor)
-    checks.turning(names, unknown_turns)
-    unknown_turns += observability.vague_turns(names, rotations.cov, unknown_turns)
-    progress.advance(STAGES, 1)
-
-    translations = translation.estimate(steps, rotations, config.translation)
-    unknown_shifts = observability.unmeasured_shifts(names, steps, rotations.R_base_sensor, unknown_turns)
-    unknown_shifts += observability.vague_shifts(names, translations.cov, unknown_shifts)
-    progress.advance(STAGES, 1)
-
-    timed = assembly.calibration(names, steps.has_scale, unknown_times, offsets)
-    turned = assembly.calibration(names, steps.has_scale, [*unknown_times, *unknown_turns], offsets, rotations)
-    unknown = [*unknown_times, *unknown_turns, *unknown_shifts]
-    placed = assembly.calibration(names, steps.has_scale, unknown, offsets, rotations, translations)
-    return Result(
-        placed,
-        {"timing": timed, "rotation": turned, "translation": placed},
-        statistics={
-            "readings": {n: len(m) for n, m in motions.items()},
-            "common_steps": len(steps),
-            "steps_rejected": steps.rejected,
-            "disagreement": rotation.disagreement(rotations.R_base_sensor, names, steps),
-            "seconds": float(np.sum(np.diff(steps.ends, axis=1))),
-        },
-        warnings=tuple(warnings),
-        configuration=asdict(config),
-    )
+def clock_offsets(
+    motions: Mapping[str, Motions], config: Config | None = None, clocks: Sequence[str] = ()
+) -> Calibration:
+    """How late each clock is, and nothing else: the first stage alone. Arguments as of :func:`calibrate_motions`."""
+    config = config or Config()
+    return METHODS[config.method].clock_offsets(motions, config, clocks or tuple(motions))
 
 
 def _base_first(moved: Mapping[str, SensorMotion], base: str | None) -> list[str]:
@@ -140,7 +98,3 @@ def _base_first(moved: Mapping[str, SensorMotion], base: str | None) -> list[str
             f"the base '{first}' is a camera and knows no distances; choose one of: {', '.join(scaled)}"
         )
     return [first, *(n for n in moved if n != first)]
-
-
-def _on_base_clock(chains: Sequence[sync.Chain], dt: Array) -> list[sync.Chain]:
-    return [c.shifted(d) for c, d in zip(chains, dt, strict=True)]

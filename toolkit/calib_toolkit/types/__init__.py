@@ -1,6 +1,7 @@
 """The data that flows between the rooms: immutable, struct-of-arrays."""
 
 from calib_toolkit.types.calibration import Calibration, Transform, Undetermined
+from calib_toolkit.types.measured import Measured
 from calib_toolkit.types.motions import Motions, Trajectory
 from calib_toolkit.types.pairs import Pair, PairEstimate
 from calib_toolkit.types.readings import Fix, LazyReadings, MotionReading, PoseReading, Scan
@@ -13,6 +14,7 @@ __all__ = [
     "Fix",
     "LazyReadings",
     "Log",
+    "Measured",
     "MotionReading",
     "Motions",
     "Pair",
