@@ -15,6 +15,7 @@ from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
 from calib_toolkit import cli, open_log, se3
+from calib_toolkit.config import METHODS
 from calib_toolkit.result_file import calibration_dict
 from calib_toolkit_datasets.simulation.vehicle import path
 
@@ -85,13 +86,14 @@ def timed(drive, tmp_path_factory):
     return out, evaluate(*arguments)
 
 
-def test_one_row_for_each_camera_of_each_repeat(timed):
+def test_one_row_for_each_camera_of_each_repeat_and_method(timed):
     rows = rows_of(timed[0] / "timing.csv")
-    assert [(r["seconds"], r["spread"], r["repeat"], r["drive"], r["sensor"]) for r in rows] == [
-        (seconds, spread, str(k), "first" if seconds == "30" or k != 1 else "second", "cam1")
+    assert [(r["seconds"], r["spread"], r["repeat"], r["drive"], r["sensor"], r["estimator"]) for r in rows] == [
+        (seconds, spread, str(k), "first" if seconds == "30" or k != 1 else "second", "cam1", method)
         for seconds in ("15", "30")
         for spread in ("0.1", "1")
         for k in range(3)
+        for method in METHODS
     ]
     assert {r["status"] for r in rows} == {"found"}
     assert max(abs(float(r["dt_ms"])) for r in rows if r["seconds"] == "30") < 5
@@ -104,12 +106,15 @@ def test_what_is_too_long_is_said(timed):
         assert "60 s: longer than first, second (44." in text
 
 
-def test_the_summary_is_that_of_the_table(timed):
+@pytest.mark.parametrize("method", METHODS)
+def test_the_summary_is_that_of_the_table(timed, method):
     out, printed = timed
-    rows = [r for r in rows_of(out / "timing.csv") if (r["seconds"], r["spread"]) == ("15", "1")]
+    wanted = ("15", "1", method)
+    rows = [r for r in rows_of(out / "timing.csv") if (r["seconds"], r["spread"], r["estimator"]) == wanted]
     e = np.abs([float(r["dt_ms"]) for r in rows])
     ratio = e / [float(r["sigma_dt_ms"]) for r in rows]
-    lines = [line for line in (out / "timing.md").read_text().splitlines() if line.startswith("| 15 | +-1 s |")]
+    start = f"| 15 | +-1 s | {method} |"
+    lines = [line for line in (out / "timing.md").read_text().splitlines() if line.startswith(start)]
     (cells,) = [[c.strip() for c in line.strip("|").split("|")] for line in lines]
     numbers = [np.median(e), np.percentile(e, 95), e.max(), e.mean(), np.sqrt(np.mean(e**2))]
     assert cells[3:8] == [f"{v:.2f}" for v in numbers]
@@ -125,12 +130,12 @@ def test_a_pair_beside_least_squares_and_opencv(drive, tmp_path):
     arguments = ("pair", drive, "-o", tmp_path, "--repeats", 2, "--seconds", 30, "--jobs", 1, "--baseline")
     printed = evaluate(*arguments)
     there = opencv_has_hand_eye()
-    expected = ["paper", "least-squares", *(OPENCV_METHODS if there else [])]
+    expected = [*METHODS, "least-squares", *(OPENCV_METHODS if there else [])]
     rows = rows_of(tmp_path / "pair.csv")
     assert [r["estimator"] for r in rows] == expected * 2
     assert {r["sensor"] for r in rows} == {"velo-ins"}
     assert ("this OpenCV has no calibrateHandEye (4.x has)" in printed) is not there
-    ours = [r for r in rows if r["estimator"] == "paper"]
+    ours = [r for r in rows if r["estimator"] in METHODS]
     assert max(float(r["rotation_deg"]) for r in ours) < 1
     assert max(float(r["translation_m"]) for r in ours) < 0.5
 
@@ -138,7 +143,8 @@ def test_a_pair_beside_least_squares_and_opencv(drive, tmp_path):
 def test_a_panoramic_rig_without_images_says_so(drive, tmp_path):
     printed = evaluate("panoramic", drive, "-o", tmp_path, "--repeats", 1, "--jobs", 1)
     assert "no panorama: first holds no images, only motions of cam0" in printed
-    assert [r["estimator"] for r in rows_of(tmp_path / "panoramic.csv")] == ["paper-together", "paper-separate"]
+    expected = [f"{method}-{way}" for method in METHODS for way in ("together", "separate")]
+    assert [r["estimator"] for r in rows_of(tmp_path / "panoramic.csv")] == expected
     assert not (tmp_path / "panorama.png").exists()
 
 
@@ -146,9 +152,21 @@ def test_a_drive_that_tells_nothing_is_rows_of_refusals(tmp_path):
     still = simulated(tmp_path / "still", seconds=30, drive="static")
     printed = evaluate("pair", still, "-o", tmp_path / "out", "--repeats", 2, "--seconds", 20, "--jobs", 1)
     rows = rows_of(tmp_path / "out" / "pair.csv")
-    assert [r["status"] for r in rows] == ["refused"] * 4
+    n = 2 * (len(METHODS) + 1)
+    assert [r["status"] for r in rows] == ["refused"] * n
     assert all(r["note"] for r in rows)
-    assert "4 rows, 4 of them refused" in printed
+    assert f"{n} rows, {n} of them refused" in printed
+
+
+def test_methods_are_chosen_by_name(drive, tmp_path):
+    arguments = ("pair", drive, "--repeats", 1, "--seconds", 20, "--jobs", 1)
+    evaluate(*arguments, "-o", tmp_path / "one", "--method", "paper", "--method", "paper")
+    assert [r["estimator"] for r in rows_of(tmp_path / "one" / "pair.csv")] == ["paper", "least-squares"]
+    sentence = refused(*arguments, "-o", tmp_path / "one", "--seed", 1)
+    assert "give the same, or choose another folder with -o" in sentence
+    wrong = evaluate(*arguments, "-o", tmp_path / "two", "--method", "paper", "--method", "papier", status=2)
+    assert f"there is no method 'papier'; there are: {', '.join(METHODS)}" in " ".join(wrong.split())
+    assert not (tmp_path / "two").exists()
 
 
 @pytest.fixture
@@ -202,7 +220,7 @@ def test_the_number_of_processes_changes_nothing(drive, tmp_path):
 
 
 def test_a_kill_loses_only_what_was_running(drive, tmp_path):
-    arguments = ["pair", drive, "--repeats", 20, "--seconds", "12", "--jobs", 1]
+    arguments = ["pair", drive, "--repeats", 20, "--seconds", "12", "--jobs", 1, "--method", "paper"]
     evaluate(*arguments, "-o", tmp_path / "whole")
     whole = (tmp_path / "whole" / "pair.csv").read_bytes()
 
@@ -253,8 +271,7 @@ def test_a_drive_without_truth_is_refused_and_a_given_one_taken(no_truth, tmp_pa
     )
     (tmp_path / "t.json").write_text(json.dumps(calibration_dict(truth)))
     evaluate(*arguments, "--truth", tmp_path / "t.json")
-    (row, _) = rows_of(tmp_path / "out" / "pair.csv")
-    assert float(row["rotation_deg"]) < 1
+    assert max(float(row["rotation_deg"]) for row in rows_of(tmp_path / "out" / "pair.csv")) < 1
 
 
 @pytest.mark.parametrize("name", ["appearance", "full"])
@@ -325,8 +342,10 @@ def test_what_failed_unexpectedly_is_told_by_the_exit_status(drive, tmp_path, mo
 
     monkeypatch.setattr(measures, "calibrate_motions", failing)
     arguments = ("pair", drive, "-o", tmp_path, "--repeats", 1, "--seconds", 20, "--jobs", 1)
-    assert "2 rows failed unexpectedly" in evaluate(*arguments, status=3)
-    assert "1 x paper: unexpected ValueError: array must not contain infs" in (tmp_path / "pair.md").read_text()
+    assert f"{len(METHODS)} row{'s' * (len(METHODS) > 1)} failed unexpectedly" in evaluate(*arguments, status=3)
+    summary = (tmp_path / "pair.md").read_text()
+    for method in METHODS:
+        assert f"1 x {method}: unexpected ValueError: array must not contain infs" in summary
 
 
 def test_a_folder_that_takes_nothing_is_refused(drive, tmp_path):
@@ -361,7 +380,9 @@ def test_the_recordings_become_folders_with_a_truth(folders):
 @pytest.mark.parametrize(("name", "at_most"), [("kitti", 0.6), ("ladybug", 0.7)])
 def test_clocks_of_the_recordings_are_found_within_a_millisecond(folders, tmp_path, name, at_most):
     evaluate("timing", folders / name, "-o", tmp_path, "--repeats", 5, "--seconds", "100", "--jobs", 2)
-    e = np.abs([float(r["dt_ms"]) for r in rows_of(tmp_path / "timing.csv")])
-    assert len(e) == (30 if name == "kitti" else 40)
-    assert np.median(e) < at_most
-    assert e.max() < 3
+    rows = rows_of(tmp_path / "timing.csv")
+    for method in METHODS:
+        e = np.abs([float(r["dt_ms"]) for r in rows if r["estimator"] == method])
+        assert len(e) == (30 if name == "kitti" else 40)
+        assert np.median(e) < at_most
+        assert e.max() < 3

@@ -16,7 +16,8 @@ Array = NDArray[np.float64]
 
 SHARE = 0.3
 """A parameter is not determined if an undetermined direction has at least this component along it."""
-
+WORTH = {"x": 1.0, "y": 1.0, "z": 1.0, "rx": 0.1, "ry": 0.1, "rz": 0.1, "dt": 1.0}
+"""Metres, radians and seconds that are worth the same where a direction mixes them."""
 
 ANYTHING = {"x": 2.0, "y": 2.0, "z": 2.0, "rx": 1.0, "ry": 1.0, "rz": 1.0, "dt": 1.0}
 """Sigma of what the drive says nothing about: metres, radians, seconds."""
@@ -26,9 +27,11 @@ def determined(names: Sequence[str], undetermined: Sequence[Undetermined]) -> ND
     """(n, 7) whether each sensor's each parameter is determined."""
     known = np.ones((len(names), len(PARAMETERS)), dtype=bool)
     for u in undetermined:
-        for key, component in u.direction.items():
+        parts = {key: component / WORTH[key.rpartition(".")[2]] for key, component in u.direction.items()}
+        size = np.linalg.norm(list(parts.values()))
+        for key, component in parts.items():
             name, _, parameter = key.rpartition(".")
-            if abs(component) >= SHARE:
+            if abs(component) >= SHARE * size:
                 known[names.index(name), PARAMETERS.index(parameter)] = False
     return known
 
@@ -61,10 +64,7 @@ def calibration(
     else:
         t = translations.t_base_sensor
         cov[:, :3, :, :3] = translations.cov.reshape(n, 3, n, 3)
-    joint: Array = cov.reshape(7 * n, 7 * n)
-    for u in undetermined:
-        spread = _vector(names, u)
-        joint = joint + np.outer(spread, spread)
+    joint = with_unknown(names, undetermined, cov.reshape(7 * n, 7 * n))
     return Calibration(
         names[0],
         names,
@@ -77,10 +77,21 @@ def calibration(
     )
 
 
+def with_unknown(names: Sequence[str], undetermined: Sequence[Undetermined], cov: Array) -> Array:
+    """A covariance (7n, 7n) with ``ANYTHING`` along directions that are not determined."""
+    for u in undetermined:
+        vector = _vector(names, u)
+        cov = cov + np.outer(vector, vector)
+    return cov
+
+
 def _vector(names: Sequence[str], u: Undetermined) -> Array:
     """(7n,) an undetermined direction, as long as what is not known along it."""
     found = np.zeros((len(names), len(PARAMETERS)))
     for key, component in u.direction.items():
         name, _, parameter = key.rpartition(".")
-        found[names.index(name), PARAMETERS.index(parameter)] = component * ANYTHING[parameter]
-    return found.ravel()
+        found[names.index(name), PARAMETERS.index(parameter)] = component
+    # as far as the first parameter can be from anything
+    return np.asarray(
+        found.ravel() * min(ANYTHING[k.rpartition(".")[2]] / abs(c) for k, c in u.direction.items() if c)
+    )

@@ -68,3 +68,11 @@ def turning(names: Sequence[str], unknown: Sequence[Undetermined]) -> None:
             "the vehicle hardly turned in this part of the drive, so nothing can be told of how the sensors sit; "
             "drive bends to both sides, and a ramp, kerbs or rough ground"
         )
+
+
+def still() -> None:
+    """Refuse a drive on which the vehicle stood."""
+    raise NotObservableError(
+        "the vehicle hardly moved in this part of the drive, so nothing can be told of how the sensors sit; drive "
+        "bends to both sides, and a ramp, kerbs or rough ground"
+    )

@@ -15,7 +15,7 @@ from calib_toolkit.timing import TimingOptions
 from calib_toolkit.translation import TranslationOptions
 from calib_toolkit.types import Measured
 
-METHODS = ("paper",)
+METHODS = ("joint", "paper")
 TINY = 1e-3
 
 
@@ -35,7 +35,7 @@ class Config:
     the sensor plugins, by sensor name or kind. prior: numbers that were measured by hand.
     """
 
-    method: str = "paper"
+    method: str = "joint"
     base: str | None = None
     start: float = 0.0
     duration: float | None = None

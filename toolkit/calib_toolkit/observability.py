@@ -42,7 +42,7 @@ def unmeasured_times(names: Sequence[str], chains: Sequence[Chain], clocks: Sequ
         slope = np.zeros((len(names), 1, 1))
     measured = {
         clocks[0],
-        *(c for c, other in zip(clocks, slope, strict=True) if _stand_out(slope[0], other, 12.0, 0.0)),
+        *(c for c, other in zip(clocks, slope, strict=True) if stand_out(slope[0], other, 12.0, 0.0)),
     }
     return [
         Undetermined(
@@ -66,7 +66,7 @@ def unmeasured_turns(names: Sequence[str], steps: Steps, R: Array) -> list[Undet
             found.append(
                 Undetermined(
                     _direction(name, ("rx", "ry", "rz"), v),
-                    f"the rotation of {name} about {_words(v, names[0])} was not determined: the vehicle {why}; "
+                    f"the rotation of {name} about {axis_words(v, names[0])} was not determined: the vehicle {why}; "
                     "drive bends, and a ramp, kerbs or rough ground",
                 )
             )
@@ -97,7 +97,7 @@ def unmeasured_shifts(
         found += [
             Undetermined(
                 _direction(name, ("x", "y", "z"), v),
-                f"the position of {name} along {_words(v, names[0])} was not determined: {why}",
+                f"the position of {name} along {axis_words(v, names[0])} was not determined: {why}",
             )
             for v in null
         ]
@@ -148,10 +148,10 @@ def _null_directions(w_base: Array, w_sensor: Array, keep: Array) -> Array:
     by_base, by_sensor = keep @ se3.skew(w_base), keep @ se3.skew(w_sensor)
     excitation = np.einsum("mia,mib->ab", by_base, by_sensor)
     _, vectors = np.linalg.eigh(0.5 * (excitation + excitation.T))
-    return np.array([v for v in vectors.T if not _stand_out(by_base @ v, by_sensor @ v, 16.0, COMMON)]).reshape(-1, 3)
+    return np.array([v for v in vectors.T if not stand_out(by_base @ v, by_sensor @ v)]).reshape(-1, 3)
 
 
-def _stand_out(a: Array, b: Array, kurtosis: float, common: float) -> bool:
+def stand_out(a: Array, b: Array, kurtosis: float = 16.0, common: float = COMMON) -> bool:
     """Whether two noisy readings (m, d) of one signal hold any: their product against its spread if they did not.
 
     If both were noise, the variance of ``a . b`` would be at most ``E |a - b|^4 / kurtosis``: 12 in one
@@ -177,7 +177,7 @@ def _direction(name: str, axes: tuple[str, str, str], v: Array) -> dict[str, flo
     return {f"{name}.{axis}": float(x) for axis, x in zip(axes, v, strict=True)}
 
 
-def _words(v: Array, base: str) -> str:
+def axis_words(v: Array, base: str) -> str:
     largest = int(np.argmax(np.abs(v)))
     if abs(v[largest]) > 0.95:
         return f"{'xyz'[largest]} of {base}"

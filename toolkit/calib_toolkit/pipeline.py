@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from calib_toolkit import cache, paper
+from calib_toolkit import cache, joint, paper
 from calib_toolkit.config import Config
 from calib_toolkit.errors import ConfigError, DataError
 from calib_toolkit.estimation import SensorMotion, estimate_motions
@@ -13,7 +13,7 @@ from calib_toolkit.progress import Progress, Silent
 from calib_toolkit.result_file import read_calibration
 from calib_toolkit.types import Calibration, Log, Motions, Result
 
-METHODS = {"paper": paper}
+METHODS = {"joint": joint, "paper": paper}
 """The estimators: modules with ``calibrate`` and ``clock_offsets``."""
 TRUTH = "truth.json"
 """A calibration that may lie in a recording's folder, to compare with."""

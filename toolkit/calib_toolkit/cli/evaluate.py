@@ -15,6 +15,16 @@ LEFT_TO_THE_FILE = ("mean", "RMS", "sigma", "sections", "no truth", "paper")
 """Columns of the summary that a terminal has no room for."""
 
 
+def _methods(ctx: click.Context, param: click.Parameter, given: tuple[str, ...]) -> tuple[str, ...]:
+    """The methods named, each once, or all there are; asked of the configuration only when the command runs."""
+    from calib_toolkit.config import METHODS
+
+    for name in given:
+        if name not in METHODS:
+            raise click.BadParameter(f"there is no method '{name}'; there are: {', '.join(METHODS)}", ctx, param)
+    return tuple(dict.fromkeys(given)) or tuple(METHODS)
+
+
 @click.command()
 @click.argument("protocol", type=click.Choice(NAMES))
 @click.argument("drives", metavar="DRIVE...", nargs=-1, required=True, type=click.Path(path_type=Path))
@@ -32,9 +42,16 @@ LEFT_TO_THE_FILE = ("mean", "RMS", "sigma", "sections", "no truth", "paper")
 )
 @click.option("--seconds", metavar="A,B,...", help="Lengths of the sections; the paper's by default.")
 @click.option(
-    "--baseline", is_flag=True, help="Other methods beside: OpenCV's for 'pair', least squares for 'panoramic'."
+    "--baseline", is_flag=True, help="Baselines beside: OpenCV's for 'pair', least squares for 'panoramic'."
 )
-@click.option("--method", type=click.Choice(["paper"]), default="paper", show_default=True, help="Estimator.")
+@click.option(
+    "--method",
+    "methods",
+    metavar="NAME",
+    multiple=True,
+    callback=_methods,
+    help="Estimator to compare, again for each; all of them by default. Baselines use the first one's clock offsets.",
+)
 @click.option("--jobs", type=click.IntRange(min=1), help="Processes; one for each core by default.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the sections.")
 @click.pass_context
@@ -49,7 +66,7 @@ def evaluate(
     repeats: int,
     seconds: str | None,
     baseline: bool,
-    method: str,
+    methods: tuple[str, ...],
     jobs: int | None,
     seed: int,
 ) -> None:
@@ -66,17 +83,17 @@ def evaluate(
     from calib_toolkit.config import Config
     from calib_toolkit.evaluation import experiment, figures, panorama, store, summary
     from calib_toolkit.evaluation.drives import open_drives
-    from calib_toolkit.evaluation.errors import UNITS
+    from calib_toolkit.evaluation.errors import UNEXPECTED, UNITS
     from calib_toolkit.evaluation.protocols import protocol as named
     from calib_toolkit.result_file import read_calibration
 
     chosen = named(protocol)
     lengths = _lengths(seconds) or chosen.seconds
-    config = Config(method=method, seed=seed, jobs=jobs or os.cpu_count() or 1)
+    config = Config(seed=seed, jobs=jobs or os.cpu_count() or 1)
     known = read_calibration(truth) if truth else None
     names = _names(sensors)
-    choices = experiment.Choices(repeats, lengths, baseline)
-    chosen.estimators(method, baseline)  # refuses what does not go together
+    choices = experiment.Choices(repeats, lengths, methods, baseline)
+    chosen.estimators(methods, baseline)  # refuses what does not go together
 
     def check(truths: "Mapping[str, Calibration]") -> None:
         experiment.check(chosen, truths)
@@ -97,8 +114,11 @@ def evaluate(
     for note in (*done.skipped, *notes):
         click.echo(note)
     click.echo(f"written: {', '.join(str(out / f'{protocol}.{end}') for end in ('csv', 'md', 'png'))}")
-    if failed := sum(row["note"].startswith(experiment.UNEXPECTED) for row in done.rows):
-        click.echo(f"{failed} rows failed unexpectedly, a fault of this program: see the table's notes", err=True)
+    if failed := sum(row["note"].startswith(UNEXPECTED) for row in done.rows):
+        click.echo(
+            f"{failed} row{'s' * (failed > 1)} failed unexpectedly, a fault of this program: see the table's notes",
+            err=True,
+        )
         ctx.exit(3)
 
 

@@ -2,10 +2,14 @@
 
 from pathlib import Path
 from tempfile import TemporaryFile
+from typing import TYPE_CHECKING
 
 import click
 
-from calib_toolkit.errors import DataError
+from calib_toolkit.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    from calib_toolkit.config import Config
 
 
 @click.command()
@@ -16,8 +20,11 @@ from calib_toolkit.errors import DataError
 @click.option("--base", metavar="NAME", help="Sensor whose frame the poses are in; the first that has scale.")
 @click.option("--start", type=float, help="Seconds to skip.")
 @click.option("--duration", type=float, help="Seconds to use.")
-@click.option("--method", type=click.Choice(["paper"]), help="Estimator.")
+@click.option("--method", type=click.Choice(["joint", "paper"]), help="Estimator; joint by default.")
 @click.option("--config", "config_file", type=click.Path(path_type=Path), help="TOML file of options.")
+@click.option(
+    "--prior", "prior_file", metavar="FILE", type=click.Path(path_type=Path), help="TOML of measured numbers."
+)
 @click.option("--jobs", type=click.IntRange(min=1), help="Processes; one for each core by default.")
 @click.option("--seed", type=int, help="Seed of everything random.")
 @click.option("--plugin", "plugins", multiple=True, type=click.Path(path_type=Path), help="One-file plugin.")
@@ -30,6 +37,7 @@ def run(
     out: Path | None,
     format_id: str | None,
     config_file: Path | None,
+    prior_file: Path | None,
     plugins: tuple[Path, ...],
     **chosen: object,
 ) -> None:
@@ -52,6 +60,8 @@ def run(
     given = {name: value for name, value in chosen.items() if value is not None}
     # click has seen to the types
     config = replace(read_config(config_file) if config_file else Config(), **given)  # type: ignore[arg-type]
+    if prior_file:
+        config = _with_prior(config, prior_file)
     installed = registry(plugins)
     log = open_log(drive, format_id, installed).select(_names(sensors))
     file = _writable(out) if out else None
@@ -65,6 +75,20 @@ def run(
         click.echo(f"written: {file}")
     if not result.complete:
         ctx.exit(3)
+
+
+def _with_prior(config: "Config", file: Path) -> "Config":
+    """The configuration with a file's measured numbers, in the base that the file names."""
+    from dataclasses import replace
+
+    from calib_toolkit.prior_file import read_prior
+
+    prior = read_prior(file)
+    if prior.base and config.base and prior.base != config.base:
+        raise ConfigError(
+            f"the numbers in {file} are given in {prior.base}, and the base of this run is {config.base}; choose one"
+        )
+    return replace(config, base=config.base or prior.base, prior=prior.numbers)
 
 
 def _writable(out: Path) -> Path:

@@ -1,4 +1,4 @@
-"""What the paper's method is compared with: two sensors' hand-eye calibration without any variance.
+"""What the methods are compared with: two sensors' hand-eye calibration without any variance.
 
 Every step k of two sensors satisfies ``A_k X = X B_k`` with ``X = T_a_b``, A and B the motions of a and b.
 """
@@ -14,6 +14,7 @@ from calib_toolkit.sync import Steps
 
 Array = NDArray[np.float64]
 
+LEAST_SQUARES = "least-squares"
 OPENCV_METHODS = {"opencv-tsai": "TSAI", "opencv-park": "PARK", "opencv-daniilidis": "DANIILIDIS"}
 POSES = 200
 """OpenCV compares every pose with every other one."""
@@ -22,8 +23,8 @@ POSES = 200
 def least_squares(steps: Steps) -> Array:
     """``T_a_b`` (4, 4) of steps of two sensors: Kabsch on the rotation vectors, then linear least squares (VIII-D).
 
-    Every step weighs the same, but they are the paper's own: on its clock offsets, and without those that its gate
-    of ten sigma left out. The translation is nan unless both sensors have scale. Raises NotObservableError.
+    Every step weighs the same, but they are those that the paper's gate of ten sigma leaves, on clock offsets that
+    a method found. The translation is nan unless both sensors have scale. Raises NotObservableError.
     """
     (w_a, w_b), (p_a, p_b) = steps.vec[..., 3:], steps.vec[..., :3]
     R = kabsch(w_a, w_b)

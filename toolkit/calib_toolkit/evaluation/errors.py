@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_toolkit import se3
+from calib_toolkit.errors import CalibrationError
 
 Array = NDArray[np.float64]
 
@@ -19,6 +20,10 @@ UNITS = {
     "dt": "ms",
 }
 """Unit of every error and sigma in the tables."""
+FAILURES = (CalibrationError, ValueError, ArithmeticError)
+"""What must cost one estimator its row, and nobody else."""
+UNEXPECTED = "unexpected"
+"""How the note begins of what should not have been refused, but made the program fail."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +40,11 @@ class Finding:
     sigma: Mapping[str, float] = field(default_factory=dict)
     undetermined: tuple[str, ...] = ()
     refused: str = ""
+
+
+def refusal(e: Exception) -> str:
+    """The sentence on one of the ``FAILURES``."""
+    return str(e) if isinstance(e, CalibrationError) else f"{UNEXPECTED} {type(e).__name__}: {e}"
 
 
 def rotation_error(R_error: Array) -> dict[str, float]:

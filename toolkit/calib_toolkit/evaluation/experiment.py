@@ -1,7 +1,7 @@
 """All repeats of an experiment: drawn, done in parallel, kept as they come, and never done twice."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -9,11 +9,11 @@ from typing import Any
 import joblib
 
 from calib_toolkit import cache
-from calib_toolkit.config import Config
-from calib_toolkit.errors import CalibrationError, DataError
+from calib_toolkit.config import METHODS, Config
+from calib_toolkit.errors import DataError
 from calib_toolkit.evaluation import baselines
 from calib_toolkit.evaluation.drives import Drive
-from calib_toolkit.evaluation.errors import UNITS, Finding
+from calib_toolkit.evaluation.errors import FAILURES, UNITS, Finding, refusal
 from calib_toolkit.evaluation.protocols import Protocol, protocol
 from calib_toolkit.evaluation.sections import Draw, Section, cut, plan, side_by_side
 from calib_toolkit.evaluation.store import Row, Store
@@ -22,16 +22,17 @@ from calib_toolkit.types import Calibration
 
 DRAW = ("drive", "seconds", "spread", "repeat")
 FINDING = ("estimator", "sensor")
-UNEXPECTED = "unexpected"
-"""How the note begins of what should not have been refused, but made the program fail."""
 
 
 @dataclass(frozen=True)
 class Choices:
-    """repeats: sections of each length. seconds: the lengths. baseline: whether other methods run beside."""
+    """repeats: sections of each length. seconds: the lengths. methods: the toolkit's own that are compared.
+    baseline: whether others run beside.
+    """
 
     repeats: int
     seconds: tuple[float, ...]
+    methods: tuple[str, ...] = METHODS
     baseline: bool = False
 
 
@@ -61,9 +62,10 @@ def run(
         raise DataError(
             f"no recording lasts long enough: {'; '.join(skipped)}; choose shorter lengths with --seconds"
         )
-    estimators = experiment.estimators(config.method, choices.baseline)
+    estimators = experiment.estimators(choices.methods, choices.baseline)
     labels = experiment.labels(tuple(drives[0].motions))
-    work = _Work(name, config, tuple(estimators), tuple(labels))
+    configs = tuple(replace(config, method=m) for m in choices.methods)
+    work = _Work(name, configs, tuple(experiment.baselines(choices.baseline)), tuple(estimators), tuple(labels))
     store = Store(folder, name, _settings(name, drives, choices, config, estimators), columns(experiment))
     done = _finished(store.read(), len(estimators) * len(labels))
     done = {key: done[key] for d in draws if (key := _key(d, drives)) in done}
@@ -121,27 +123,23 @@ def columns(experiment: Protocol) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class _Work:
-    """One repeat, as a worker does it."""
+    """One repeat, as a worker does it. configs: one for each method. others: the baselines. estimators: of both."""
 
     name: str
-    config: Config
+    configs: tuple[Config, ...]
+    others: tuple[str, ...]
     estimators: tuple[str, ...]
     labels: tuple[str, ...]
 
     def __call__(self, draw: Draw, section: Section, drive: str) -> tuple[Draw, list[Row]]:
         experiment = protocol(self.name)
         try:
-            findings = experiment.measure(section, self.config, list(self.estimators))
-        except CalibrationError as e:
-            findings = self._refused(str(e))
-        except (ValueError, ArithmeticError) as e:  # one bad section must not cost all the others
-            findings = self._refused(f"{UNEXPECTED} {type(e).__name__}: {e}")
+            findings = experiment.measure(section, self.configs, self.others)
+        except FAILURES as e:  # one bad section must not cost all the others
+            findings = [Finding(m, label, refused=refusal(e)) for m in self.estimators for label in self.labels]
         drawn = (drive, f"{draw.seconds:g}", f"{draw.spread:g}", str(draw.repeat), f"{section.start:.3f}")
         start = dict(zip((*DRAW, "start"), drawn, strict=True))
         return draw, [start | _row(f, columns(experiment)) for f in findings]
-
-    def _refused(self, sentence: str) -> list[Finding]:
-        return [Finding(m, label, refused=sentence) for m in self.estimators for label in self.labels]
 
 
 def _row(f: Finding, titles: Sequence[str]) -> dict[str, str]:
@@ -192,7 +190,7 @@ def _settings(
         "seconds": list(choices.seconds),
         "repeats": choices.repeats,
         "seed": config.seed,
-        "method": config.method,
+        "methods": list(choices.methods),
         "estimators": list(estimators),
         "options": options,
         "version": ours,

@@ -7,20 +7,30 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_toolkit import checks, observability, se3, sync, timing
+from calib_toolkit import se3, sync
 from calib_toolkit.config import Config
 from calib_toolkit.errors import CalibrationError, NotObservableError
 from calib_toolkit.evaluation import baselines
-from calib_toolkit.evaluation.errors import DELTA, EULER, POSITION, Finding, rotation_error, rotation_sigma
+from calib_toolkit.evaluation.errors import (
+    DELTA,
+    EULER,
+    FAILURES,
+    POSITION,
+    Finding,
+    refusal,
+    rotation_error,
+    rotation_sigma,
+)
 from calib_toolkit.evaluation.sections import Section
-from calib_toolkit.pipeline import calibrate_motions
+from calib_toolkit.pipeline import calibrate_motions, clock_offsets
 from calib_toolkit.types import Calibration, Motions
 
 Array = NDArray[np.float64]
 
 FORWARD_LEFT_UP = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Turns a camera's axes (right, down, ahead) into a vehicle's, so that roll is about the optical axis."""
-LEAST_SQUARES = "least-squares"
+TOGETHER, SEPARATE = "-together", "-separate"
+"""Endings of a method's name: all cameras at once, and each with the first."""
 
 
 @dataclass(frozen=True)
@@ -34,70 +44,63 @@ class Turn:
 
 @dataclass(frozen=True)
 class Part:
-    """Some sensors of a section, and what calibrating them yields: a calibration, or the sentence that refuses."""
+    """Some sensors of a section, and what a method makes of them: a calibration, or the sentence that refuses.
+
+    at: the instant of the base's clock for which offsets are told.
+    """
 
     motions: Mapping[str, Motions]
     clocks: tuple[str, ...]
+    config: Config
+    at: float
     calibration: Calibration | None
     refused: str = ""
 
 
-def measure_timing(section: Section, config: Config, estimators: list[str]) -> list[Finding]:
-    """Clock offsets of all sensors to the first, each on a clock of its own (section VIII-C)."""
-    (method,) = estimators
-    names, truth = list(section.motions), section.truth
-    found, known = _times(section.motions, names, config)
+def measure_timing(section: Section, configs: Sequence[Config], others: Sequence[str]) -> list[Finding]:
+    """Clock offsets of all sensors to the first, each on a clock of its own (section VIII-C), by each method."""
     findings = []
-    for i, name in enumerate(names[1:], start=1):
-        if not known[i]:
-            findings.append(Finding(method, name, undetermined=("dt",)))
-            continue
-        error = {"dt": 1e3 * (found.dt[i] - truth.dt_base_sensor[i])} if truth.determined[i, 6] else {}
-        findings.append(Finding(method, name, error, {"dt": 1e3 * float(np.sqrt(found.cov[i, i]))}))
-    return findings
-
-
-def measure_pair(section: Section, config: Config, estimators: list[str]) -> list[Finding]:
-    """Where the second sensor sits in the first one's frame (section VIII-D), beside the baselines."""
-    method, *others = estimators
-    label = "-".join(section.motions)
-    truth = section.truth
-    ours = _part(section, list(section.motions), config)
-    c = ours.calibration
-    findings = [_found_pair(method, label, c, truth) if c else Finding(method, label, refused=ours.refused)]
-    for other in others:
+    for config in configs:
         try:
-            steps, plain = _steps(ours, config), other == LEAST_SQUARES
-            T = baselines.least_squares(steps) if plain else baselines.opencv_hand_eye(steps, other)
-            error = _rotation(T, truth.T_base_sensor[1]) | _position(T, truth, 1)
-            findings.append(Finding(other, label, {k: e for k, e in error.items() if np.isfinite(e)}))
-        except CalibrationError as e:
-            findings.append(Finding(other, label, refused=str(e)))
+            findings += _found_times(config.method, clock_offsets(section.motions, config), section.truth)
+        except FAILURES as e:
+            findings += [Finding(config.method, n, refused=refusal(e)) for n in list(section.motions)[1:]]
     return findings
 
 
-def measure_panoramic(section: Section, config: Config, estimators: list[str]) -> list[Finding]:
+def measure_pair(section: Section, configs: Sequence[Config], others: Sequence[str]) -> list[Finding]:
+    """Where the second sensor sits in the first one's frame (section VIII-D), by each method and baseline."""
+    label, truth = "-".join(section.motions), section.truth
+    parts = [_part(section, list(section.motions), config) for config in configs]
+    return [
+        *(_found_pair(part, label, truth) for part in parts),
+        *(_found_beside(other, parts[0], label, truth) for other in others),
+    ]
+
+
+def measure_panoramic(section: Section, configs: Sequence[Config], others: Sequence[str]) -> list[Finding]:
     """Rotations between every two cameras: all estimated at once, and each with the first only (section VIII-E)."""
-    names, truth = list(section.motions), section.truth
-    together, separate, *plain = estimators
-    everyone = _part(section, names, config)
-    turns = [_turn(everyone, k) for k in range(len(names))]
-    findings = _found_turns(together, names, turns, truth, everyone.calibration)
-    pairs = [_part(section, [names[0], other], config) for other in names[1:]]
-    first = Turn(np.eye(3))
-    findings += _found_turns(separate, names, [first, *(_turn(p, 1) for p in pairs)], truth)
-    for estimator in plain:
-        findings += _found_turns(estimator, names, [first, *(_plain_turn(p, config) for p in pairs)], truth)
+    names, truth, first = list(section.motions), section.truth, Turn(np.eye(3))
+    findings = []
+    pairs = [[_part(section, [names[0], other], config) for other in names[1:]] for config in configs]
+    for config, apart in zip(configs, pairs, strict=True):
+        everyone = _part(section, names, config)
+        turns = [_turn(everyone, k) for k in range(len(names))]
+        findings += _found_turns(f"{config.method}{TOGETHER}", names, turns, truth, everyone.calibration)
+        findings += _found_turns(f"{config.method}{SEPARATE}", names, [first, *(_turn(p, 1) for p in apart)], truth)
+    for other in others:
+        findings += _found_turns(other, names, [first, *map(_plain_turn, pairs[0])], truth)
     return findings
 
 
 def _part(section: Section, names: list[str], config: Config) -> Part:
     clocks = tuple(c for n, c in zip(section.motions, section.clocks, strict=True) if n in names)
     motions = {n: section.motions[n] for n in names}
+    at = section.truth.t_ref
     try:
-        return Part(motions, clocks, calibrate_motions(motions, config, clocks).calibration)
-    except CalibrationError as e:
-        return Part(motions, clocks, None, str(e))
+        return Part(motions, clocks, config, at, calibrate_motions(motions, config, clocks).calibration)
+    except FAILURES as e:
+        return Part(motions, clocks, config, at, None, refusal(e))
 
 
 def _turn(part: Part, k: int) -> Turn:
@@ -107,14 +110,28 @@ def _turn(part: Part, k: int) -> Turn:
     return Turn(c.T_base_sensor[k, :3, :3], bool(c.determined[k, 3:6].all()))
 
 
-def _plain_turn(pair: Part, config: Config) -> Turn:
+def _plain_turn(pair: Part) -> Turn:
     try:
-        return Turn(baselines.kabsch(*_steps(pair, config).vec[..., 3:]))
-    except CalibrationError as e:
-        return Turn(np.eye(3), refused=str(e))
+        return Turn(baselines.kabsch(*_steps(pair).vec[..., 3:]))
+    except FAILURES as e:
+        return Turn(np.eye(3), refused=refusal(e))
 
 
-def _found_pair(method: str, label: str, c: Calibration, truth: Calibration) -> Finding:
+def _found_times(method: str, c: Calibration, truth: Calibration) -> list[Finding]:
+    findings = []
+    for i, name in enumerate(truth.names[1:], start=1):
+        if not c.determined[i, 6]:
+            findings.append(Finding(method, name, undetermined=("dt",)))
+            continue
+        error = {"dt": _dt(c, i, truth)} if truth.determined[i, 6] else {}
+        findings.append(Finding(method, name, error, {"dt": 1e3 * float(c.sigma[i, 6])}))
+    return findings
+
+
+def _found_pair(part: Part, label: str, truth: Calibration) -> Finding:
+    method, c = part.config.method, part.calibration
+    if c is None:
+        return Finding(method, label, refused=part.refused)
     known = c.determined[1]
     unknown = {k for k, yes in zip((*POSITION, *DELTA, "dt"), known, strict=True) if not yes}
     unknown |= {e for e, d in zip(EULER, DELTA, strict=True) if d in unknown}
@@ -122,7 +139,7 @@ def _found_pair(method: str, label: str, c: Calibration, truth: Calibration) -> 
     unknown |= {"translation"} if not known[:3].all() else set()
     error = _rotation(c.T_base_sensor[1], truth.T_base_sensor[1]) | _position(c.T_base_sensor[1], truth, 1)
     if truth.determined[1, 6]:
-        error["dt"] = 1e3 * float(c.dt_base_sensor[1] - truth.dt_base_sensor[1])
+        error["dt"] = _dt(c, 1, truth)
     sigma = rotation_sigma(c.covariance[10:13, 10:13])
     sigma |= dict(zip((*POSITION, "dt"), np.sqrt(np.diag(c.covariance)[[7, 8, 9, 13]]) * [1, 1, 1, 1e3], strict=True))
     return Finding(
@@ -132,6 +149,17 @@ def _found_pair(method: str, label: str, c: Calibration, truth: Calibration) -> 
         {k: s for k, s in sigma.items() if k not in unknown},
         tuple(sorted(unknown)),
     )
+
+
+def _found_beside(other: str, part: Part, label: str, truth: Calibration) -> Finding:
+    """What a baseline makes of the same sensors, on the clock offsets that a method found."""
+    try:
+        steps, plain = _steps(part), other == baselines.LEAST_SQUARES
+        T = baselines.least_squares(steps) if plain else baselines.opencv_hand_eye(steps, other)
+    except FAILURES as e:
+        return Finding(other, label, refused=refusal(e))
+    error = _rotation(T, truth.T_base_sensor[1]) | _position(T, truth, 1)
+    return Finding(other, label, {k: e for k, e in error.items() if np.isfinite(e)})
 
 
 def _found_turns(
@@ -166,33 +194,19 @@ def _position(T: Array, truth: Calibration, i: int) -> dict[str, float]:
     return {**dict(zip(POSITION, map(float, shift), strict=True)), "translation": float(np.linalg.norm(shift))}
 
 
-def _steps(part: Part, config: Config) -> sync.Steps:
-    """The steps that the pipeline works on; where it refused to go on, those on the offsets of timing alone."""
-    motions = part.motions
-    if part.calibration is not None:
-        dt = part.calibration.dt_base_sensor
-    else:
-        try:
-            found, known = _times(motions, part.clocks, config)
-        except CalibrationError as e:
-            raise NotObservableError(f"needs the clock offsets, which were not found: {e}") from e
-        if not known.all():
-            raise NotObservableError("needs the clock offsets, which this part of the drive does not tell")
-        dt = found.dt
-    chains = [sync.chain(m).shifted(d) for m, d in zip(motions.values(), dt, strict=True)]
-    return sync.synchronise(chains, config.sync.gate)
+def _dt(c: Calibration, i: int, truth: Calibration) -> float:
+    """Milliseconds by which an offset is wrong in the middle of the section."""
+    return 1e3 * float(c.dt_at(c.base, c.names[i], truth.t_ref) - truth.dt_base_sensor[i])
 
 
-def _times(
-    motions: Mapping[str, Motions], clocks: Sequence[str], config: Config
-) -> tuple[timing.TimeOffsets, NDArray[np.bool_]]:
-    """Offsets of all sensors to the first as the pipeline finds them; (n,) whether the motions tell them."""
-    names = list(motions)
-    checks.moved(motions)
-    chains = [sync.chain(m) for m in motions.values()]
-    checks.overlap(names, chains, config.timing.max_offset)
-    found = timing.estimate(chains, clocks, config.timing)
-    on_base = [c.shifted(d) for c, d in zip(chains, found.dt, strict=True)]
-    unknown = {key for u in observability.unmeasured_times(names, on_base, clocks) for key in u.direction}
-    known = np.array([f"{name}.dt" not in unknown for name in names])
-    return found, known
+def _steps(part: Part) -> sync.Steps:
+    """Common steps on the offsets that the method found; where it refused to go on, on those of timing alone."""
+    c = part.calibration
+    try:
+        c = c or clock_offsets(part.motions, part.config, part.clocks)
+    except CalibrationError as e:
+        raise NotObservableError(f"needs the clock offsets, which were not found: {e}") from e
+    if not c.determined[:, 6].all():
+        raise NotObservableError("needs the clock offsets, which this part of the drive does not tell")
+    chains = [sync.chain(m).shifted(c.dt_at(c.base, name, part.at)) for name, m in part.motions.items()]
+    return sync.synchronise(chains, part.config.sync.gate)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from calib_toolkit import se3
 from calib_toolkit.evaluation.drives import Drive
 from calib_toolkit.evaluation.errors import DELTA
-from calib_toolkit.evaluation.measures import FORWARD_LEFT_UP
+from calib_toolkit.evaluation.measures import FORWARD_LEFT_UP, TOGETHER
 from calib_toolkit.evaluation.store import Row
 from calib_toolkit.evaluation.summary import numbers
 from calib_toolkit.types import CameraIntrinsics
@@ -25,29 +25,31 @@ SIZE = (1440, 720)
 
 
 def draw(drive: Drive, rows: Sequence[Row], file: Path) -> str:
-    """Write the panorama from the truth above that from the mean of the estimated rotations; a sentence on it.
+    """Write the panorama from the truth above that from the mean of the first method's rotations; a sentence on it.
 
     Without images there is none, and the sentence says why. Raises DataError if an image can not be read.
     """
     names = list(drive.motions)
     missing = _missing(drive)
-    R = mean_rotations(rows, names, drive.truth.T_base_sensor[:, :3, :3])
+    method = next(r["estimator"] for r in rows if r["estimator"].endswith(TOGETHER))
+    some = [r for r in rows if r["estimator"] == method]
+    R = mean_rotations(some, names, drive.truth.T_base_sensor[:, :3, :3])
     if missing or R is None:
-        return f"no panorama: {missing or 'no repeat determined the rotation of every camera'}"
+        return f"no panorama: {missing or f'no repeat of {method} determined the rotation of every camera'}"
     images, intrinsics = _at_once(drive), [s.intrinsics for s in drive.log.streams.values()]
     both = []
     for rotations in (drive.truth.T_base_sensor[:, :3, :3], R):
         views = [(i, k, r) for i, k, r in zip(images, intrinsics, rotations, strict=True) if k is not None]
         both.append(panorama(views))
-    _save(both, file)
+    _save(both, f"from the mean of the rotations of {method}", file)
     return f"panorama of {', '.join(names)}: {file.name}"
 
 
 def mean_rotations(rows: Sequence[Row], names: Sequence[str], R_true: Array) -> Array | None:
-    """``R_first_camera`` (n, 3, 3) by the mean error of the joint estimates; None if some camera has none."""
+    """``R_first_camera`` (n, 3, 3) by the mean error in one estimator's rows; None if some camera has none."""
     R = [R_true[0]]
     for name, true in zip(names[1:], R_true[1:], strict=True):
-        pair = [r for r in rows if r["sensor"] == f"{names[0]}-{name}" and r["estimator"].endswith("-together")]
+        pair = [r for r in rows if r["sensor"] == f"{names[0]}-{name}"]
         delta = np.radians(np.column_stack([numbers(pair, f"{axis}_deg") for axis in DELTA]))
         delta = delta[np.isfinite(delta).all(axis=1)]
         if not len(delta):
@@ -125,13 +127,13 @@ def _missing(drive: Drive) -> str:
     return ""
 
 
-def _save(both: Sequence[Any], file: Path) -> None:
+def _save(both: Sequence[Any], second: str, file: Path) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 8), layout="constrained")
     seen = np.flatnonzero(np.any(both, axis=(0, 2, 3)))
     highest, lowest = (90 - 180 * k / SIZE[1] for k in (seen.min(), seen.max() + 1))
-    titles = ("from the true rotations", "from the mean of the estimated rotations")
+    titles = ("from the true rotations", second)
     for panel, image, title in zip(figure.subplots(2, 1, sharex=True), both, titles, strict=True):
         panel.imshow(image[..., ::-1], extent=(180, -180, -90, 90))
         panel.set_ylim(lowest, highest)

@@ -1,6 +1,6 @@
 """The experiments of section VIII: which sensors each compares, over which lengths, and what one repeat yields."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Literal
@@ -22,9 +22,9 @@ class Protocol:
 
     seconds: lengths of the sections. spreads: how far clocks are moved, seconds. parameters: whose errors are told;
     short: which of them in the short table. needs: what of the truth it can not do without.
-    choose: the sensors of a recording that are compared. estimators: what is told apart, by method and whether
-    baselines are wanted. labels: what is told of one estimator, by the sensors' names.
-    measure: all rows of one repeat.
+    choose: the sensors of a recording that are compared. ways: in which each method is used, as its name's ending.
+    baselines: what runs beside them, by whether more than the paper has is wanted. labels: what is told of one
+    estimator, by the sensors' names. measure: all rows of one repeat, by the methods' configurations and baselines.
     """
 
     title: str
@@ -34,9 +34,14 @@ class Protocol:
     short: tuple[str, ...]
     needs: Literal["clocks", "rotations"]
     choose: Callable[[Log], list[str]]
-    estimators: Callable[[str, bool], list[str]]
+    ways: tuple[str, ...]
+    baselines: Callable[[bool], list[str]]
     labels: Callable[[tuple[str, ...]], list[str]]
-    measure: Callable[[Section, Config, list[str]], list[Finding]]
+    measure: Callable[[Section, Sequence[Config], Sequence[str]], list[Finding]]
+
+    def estimators(self, methods: Sequence[str], baseline: bool) -> list[str]:
+        """All that are told apart, in the order of the rows. Raises ConfigError for what does not go together."""
+        return [*(f"{method}{way}" for method in methods for way in self.ways), *self.baselines(baseline)]
 
 
 def protocol(name: str) -> Protocol:
@@ -63,19 +68,19 @@ def _all_pairs(names: tuple[str, ...]) -> list[str]:
     return [f"{a}-{b}" for a, b in combinations(names, 2)]
 
 
-def _timing_estimators(method: str, baseline: bool) -> list[str]:
+def _none(baseline: bool) -> list[str]:
     if baseline:
         raise ConfigError("--baseline does not go with 'timing': hand-eye calibration finds no clock offsets")
-    return [method]
+    return []
 
 
-def _pair_estimators(method: str, baseline: bool) -> list[str]:
-    hand_eye = baseline and baselines.opencv_has_hand_eye()
-    return [method, measures.LEAST_SQUARES, *(baselines.OPENCV_METHODS if hand_eye else ())]
+def _hand_eye(baseline: bool) -> list[str]:
+    wanted = baseline and baselines.opencv_has_hand_eye()
+    return [baselines.LEAST_SQUARES, *(baselines.OPENCV_METHODS if wanted else ())]
 
 
-def _panoramic_estimators(method: str, baseline: bool) -> list[str]:
-    return [f"{method}-together", f"{method}-separate", *([measures.LEAST_SQUARES] if baseline else [])]
+def _least_squares(baseline: bool) -> list[str]:
+    return [baselines.LEAST_SQUARES] if baseline else []
 
 
 def _tens(last: int) -> tuple[float, ...]:
@@ -91,7 +96,8 @@ PROTOCOLS = {
         short=("dt",),
         needs="clocks",
         choose=drives.cameras,
-        estimators=_timing_estimators,
+        ways=("",),
+        baselines=_none,
         labels=_every_other,
         measure=measures.measure_timing,
     ),
@@ -103,7 +109,8 @@ PROTOCOLS = {
         short=("rotation", "translation"),
         needs="rotations",
         choose=drives.first_two,
-        estimators=_pair_estimators,
+        ways=("",),
+        baselines=_hand_eye,
         labels=_only_pair,
         measure=measures.measure_pair,
     ),
@@ -115,7 +122,8 @@ PROTOCOLS = {
         short=("rotation",),
         needs="rotations",
         choose=drives.cameras,
-        estimators=_panoramic_estimators,
+        ways=(measures.TOGETHER, measures.SEPARATE),
+        baselines=_least_squares,
         labels=_all_pairs,
         measure=measures.measure_panoramic,
     ),

@@ -29,7 +29,8 @@ class Draw:
 class Section:
     """One repeat: part of a drive whose clocks were moved. start: seconds after the drive's first common instant.
 
-    motions: the base first. truth: of these sensors, with the moved clocks.
+    motions: the base first. truth: of these sensors, with the moved clocks; its offsets are those at its ``t_ref``,
+    in the middle of the section.
     """
 
     start: float
@@ -75,7 +76,7 @@ def cut(draw: Draw, drives: Sequence[Drive], protocol: str, seed: int) -> Sectio
     }
     told, middle = drive.truth, first + draw.seconds / 2
     dt = np.array([told.dt_at(told.base, name, middle) for name in told.names])
-    truth = replace(told, dt_base_sensor=dt - moved)
+    truth = replace(told, dt_base_sensor=dt - moved, t_ref=middle)
     return Section(start, parts, drive.clocks, truth)
 
 

@@ -1,0 +1,238 @@
+"""The joint estimator, stage by stage: clocks and turns; what the drive tells of poses; the poses, and how well."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, null_space
+
+from calib_toolkit import assembly, checks, observability, se3, sync
+from calib_toolkit.config import Config
+from calib_toolkit.joint import moving, prior, report, spread, start, turning, verdict
+from calib_toolkit.joint.clocks import Clocks
+from calib_toolkit.joint.readings import ready
+from calib_toolkit.progress import Progress
+from calib_toolkit.types import Calibration, Measured, Motions, Result, Undetermined
+
+Array = NDArray[np.float64]
+
+STAGES = "clocks, poses"
+SURE = 5.0
+"""Sigma by which a sensor's turns and travel must disagree before its travel is not believed."""
+GATE = 100.0
+"""Sigma by which two sensors' angles may differ on a step that is used before their noise is known."""
+
+
+@dataclass(frozen=True)
+class Timed:
+    """What the first stage leaves: motions in order, clocks (zero where nothing told), common steps, a first guess of
+    the poses T (n, 4, 4), and the clocks that nothing told, in words.
+    """
+
+    names: tuple[str, ...]
+    motions: list[Motions]
+    turned: turning.Turning
+    clocks: Clocks
+    steps: sync.Steps
+    T: Array
+    unknown: list[Undetermined]
+
+    @property
+    def clock_cov(self) -> Array:
+        """Offsets, then skews, of the clocks but the base's; zero for those that nothing told."""
+        open_ = {int(self.clocks.of[self.names.index(_sensor(u))]) for u in self.unknown}
+        told = np.tile([float(c not in open_) for c in range(1, len(self.clocks))], 2)
+        return self.turned.clock_cov * np.outer(told, told)
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Poses T (n, 4, 4); cov: (p, p) of ``(dt, delta)`` of each sensor but the base, then of offsets and skews of the
+    clocks but the base's; what nothing told, in words; and how it was found, None for sensors without any scale.
+    """
+
+    T: Array
+    cov: Array
+    unknown: list[Undetermined]
+    found: moving.Moving | None
+
+
+def calibrate(motions: Mapping[str, Motions], config: Config, clocks: Sequence[str], progress: Progress) -> Result:
+    """All sensors at once. clocks: (n,) sensors that name the same clock share it. Raises CalibrationError."""
+    progress.begin(STAGES, 2)
+    timed = _time(motions, clocks, config.prior)
+    progress.advance(STAGES, 1)
+    turned = _turn(timed)
+    placed = _place(timed, config.prior) if timed.steps.has_scale.any() else turned
+    progress.advance(STAGES, 1)
+    final = _calibration(timed, placed)
+    stages = {"timing": _offsets(timed), "rotation": _calibration(timed, turned), "motion": final}
+    statistics = report.statistics(final, timed.motions, timed.turned, placed.found, timed.steps, config.prior)
+    return Result(final, stages, statistics=statistics)
+
+
+def clock_offsets(motions: Mapping[str, Motions], config: Config, clocks: Sequence[str]) -> Calibration:
+    """The first stage alone. Raises CalibrationError."""
+    return _offsets(_time(motions, clocks, config.prior))
+
+
+def _time(motions: Mapping[str, Motions], clocks: Sequence[str], known: Sequence[Measured]) -> Timed:
+    """How late each clock is, whatever the poses."""
+    names = tuple(motions)
+    prior.checked(known, names)
+    checks.moved(motions)
+    in_order = [ready(m) for m in motions.values()]
+    chains = [sync.chain(m) for m in in_order]
+    checks.overlap(names, chains, start.MOST_LATE)
+    middle = float(np.mean(chains[0].knots[[0, -1]]))
+    first = Clocks.starting(clocks, start.lags(chains), middle)
+    steps = _steps(names, chains, first)
+    turned = turning.estimate(in_order, start.poses(steps)[:, :3, :3], first, prior.late(known, names, first))
+    on_base = [c.shifted(turned.clocks.dt[k]) for c, k in zip(chains, turned.clocks.of, strict=True)]
+    told = {m.sensor for m in known if m.parameter == "dt"}
+    unknown = [
+        u
+        for u in observability.unmeasured_times(names, on_base, clocks)
+        if not any(clocks[names.index(t)] == clocks[names.index(_sensor(u))] for t in told)
+    ]
+    open_ = {int(turned.clocks.of[names.index(_sensor(u))]) for u in unknown}
+    late = turned.clocks.without(open_)
+    steps = _steps(names, chains, late)
+    return Timed(names, in_order, turned, late, steps, start.poses(steps), unknown)
+
+
+def _turn(timed: Timed) -> Placed:
+    """The poses as the first stage leaves them: rotations alone."""
+    n = len(timed.names)
+    q = 2 * (len(timed.clocks) - 1)
+    cov = np.zeros((6 * (n - 1) + q, 6 * (n - 1) + q))
+    at = (6 * np.arange(n - 1)[:, None] + np.arange(3, 6)).ravel()
+    cov[np.ix_(at, at)] = timed.turned.cov[: 3 * (n - 1), : 3 * (n - 1)]
+    cov[6 * (n - 1) :, 6 * (n - 1) :] = timed.clock_cov
+    T = se3.rigid(timed.turned.R_base_sensor, np.zeros((n, 3)))
+    unscaled = replace(timed.steps, has_scale=np.zeros(n, dtype=bool))
+    open_ = [verdict.turns(directions) for directions in verdict.untold(unscaled, T)]
+    return Placed(T, cov, _unknown(timed, open_, cov), None)
+
+
+def _place(timed: Timed, known: Sequence[Measured]) -> Placed:
+    """All poses, what nothing tells of them left where it is."""
+    names, T = timed.names, timed.T.copy()
+    # where nothing is told, noise may have put a sensor anywhere, which would turn the directions that are left
+    T[1:, :3, 3] -= [verdict.shifts(v) @ t for v, t in zip(verdict.untold(timed.steps, T), T[1:, :3, 3], strict=True)]
+    open_ = [
+        prior.unheld(directions, prior.information(T, names, known)[0][6 * k : 6 * k + 6, 6 * k : 6 * k + 6])
+        for k, directions in enumerate(verdict.untold(timed.steps, T))
+    ]
+    if all(directions.shape[1] == 6 for directions in open_):
+        checks.still()
+    search = partial(
+        moving.estimate,
+        timed.motions,
+        clocks=timed.clocks,
+        turn_scale=timed.turned.scale,
+        prior=lambda T: prior.information(T, names, known),
+    )
+    found = search(T=T, free=_free(open_, [np.zeros((3, 0))] * len(open_)))
+    biased = _biased(timed, open_, found)
+    if any(axes.size for axes in biased):
+        found = search(T=found.T_base_sensor, free=_free(open_, biased))
+    cov, gain = spread.covariance(found.information, found.feigned, found.free)
+    stamps = [timed.clocks.base_time(i, m.start) for i, m in enumerate(timed.motions)]
+    groups = np.split(np.arange(6 * (len(names) - 1)), len(names) - 1)
+    wider = np.sqrt(spread.inflation(found.pulls, stamps, gain, cov, groups))
+    cov = cov * np.outer(wider, wider)
+    # a clock that is off by some time moves the poses with it
+    poses, clock_cov = 6 * (len(names) - 1), timed.clock_cov
+    cov, moved = cov[:poses, :poses], (-gain @ found.by_clock)[:poses]
+    joint = np.block([[cov + moved @ clock_cov @ moved.T, moved @ clock_cov], [clock_cov @ moved.T, clock_cov]])
+    return Placed(found.T_base_sensor, joint, _unknown(timed, open_, joint), found)
+
+
+def _unknown(timed: Timed, open_: Sequence[Array], cov: Array) -> list[Undetermined]:
+    """Beside the clocks: directions that are open (6, k) of each sensor but the base, and what is known too badly."""
+    base, *others = timed.names
+    found = [u for name, v in zip(others, open_, strict=True) for u in verdict.in_words(base, name, v)]
+    n = len(timed.names)
+    poses = np.zeros((n, 6, n, 6))
+    poses[1:, :, 1:] = cov[: 6 * (n - 1), : 6 * (n - 1)].reshape(n - 1, 6, n - 1, 6)
+    shifts, turns = (poses[:, part, :, part].reshape(3 * n, 3 * n) for part in (slice(3), slice(3, 6)))
+    found += observability.vague_turns(timed.names, turns, found)
+    return [*found, *observability.vague_shifts(timed.names, shifts, found)]
+
+
+def _calibration(timed: Timed, placed: Placed) -> Calibration:
+    """The poses and clocks as one calibration."""
+    n = len(timed.names)
+    unknown = [*timed.unknown, *placed.unknown]
+    if not timed.steps.has_scale.any():
+        unknown += verdict.without_scale(timed.names)
+    to_all = np.zeros((7 * n, len(placed.cov)))
+    for i in range(1, n):
+        to_all[7 * i : 7 * i + 6, 6 * (i - 1) : 6 * i] = np.eye(6)
+        if c := int(timed.clocks.of[i]):
+            to_all[7 * i + 6, 6 * (n - 1) + c - 1] = 1.0
+    known = assembly.determined(timed.names, unknown)
+    if placed.found is None:
+        known[1:, :3] = False
+    return Calibration(
+        timed.names[0],
+        timed.names,
+        placed.T,
+        timed.clocks.dt[timed.clocks.of],
+        assembly.with_unknown(timed.names, unknown, to_all @ placed.cov @ to_all.T),
+        timed.steps.has_scale,
+        known,
+        tuple(unknown),
+        timed.clocks.skew[timed.clocks.of],
+        timed.clocks.t_ref,
+    )
+
+
+def _offsets(timed: Timed) -> Calibration:
+    """The clocks alone."""
+    n = len(timed.names)
+    cov = block_diag(np.zeros((6 * (n - 1), 6 * (n - 1))), timed.clock_cov)
+    found = _calibration(timed, Placed(np.broadcast_to(np.eye(4), (n, 4, 4)), cov, [], None))
+    known = found.determined.copy()
+    known[1:, 3:6] = False
+    return replace(found, determined=known)
+
+
+def _biased(timed: Timed, open_: Sequence[Array], found: moving.Moving) -> list[Array]:
+    """For each sensor but the base, axes (3, j) about which its turns alone say something else than its travel too.
+
+    A travel that is turned against the turns is a fault of the sensor's own motion, and tells nothing of rotation.
+    """
+    axes = []
+    for k, directions in enumerate(open_):
+        R = found.T_base_sensor[k + 1, :3, :3], timed.turned.R_base_sensor[k + 1]
+        apart = se3.log_so3(R[1] @ R[0].T)
+        # what nothing told may lie anywhere
+        told = null_space(verdict.turns(directions)[3:].T) if directions.size else np.eye(3)
+        variance, vectors = np.linalg.eigh(told.T @ timed.turned.cov[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] @ told)
+        each = told @ vectors
+        axes.append(each[:, (each.T @ apart) ** 2 > SURE**2 * variance])
+    return axes
+
+
+def _free(open_: Sequence[Array], biased: Sequence[Array]) -> Array:
+    """(9(n-1), k) orthonormal directions in which poses and biases may move. open_: (6, j) of poses, in
+    ``verdict.UNITS``. biased: (3, j) of biases.
+    """
+    poses = [null_space((v / verdict.UNITS[:, None]).T) for v in open_]
+    return block_diag(*poses, *biased)
+
+
+def _steps(names: Sequence[str], chains: Sequence[sync.Chain], clocks: Clocks) -> sync.Steps:
+    """Common steps by clocks about right."""
+    steps = sync.synchronise([c.shifted(clocks.dt[k]) for c, k in zip(chains, clocks.of, strict=True)], GATE)
+    checks.steps(steps)
+    checks.lengths(names, steps)
+    return steps
+
+
+def _sensor(u: Undetermined) -> str:
+    return next(iter(u.direction)).rpartition(".")[0]

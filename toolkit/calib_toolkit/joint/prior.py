@@ -1,0 +1,77 @@
+"""Numbers that someone measured, as information on poses and clocks."""
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calib_toolkit import delta, se3
+from calib_toolkit.errors import ConfigError
+from calib_toolkit.joint import verdict
+from calib_toolkit.joint.clocks import Clocks
+from calib_toolkit.joint.turning import Late
+from calib_toolkit.types import Measured
+
+Array = NDArray[np.float64]
+
+HELD = 1.0
+"""Metres, or their worth in radians, to which numbers must hold a direction that the drive leaves open."""
+NUMBERS = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+def checked(prior: Sequence[Measured], names: Sequence[str]) -> None:
+    """Refuse numbers of sensors that are not there. names: the base first. Raises ConfigError."""
+    for m in prior:
+        if m.sensor not in names:
+            raise ConfigError(
+                f"the prior tells of '{m.sensor}', which is not calibrated; there are: {', '.join(names)}"
+            )
+        if m.sensor == names[0]:
+            raise ConfigError(
+                f"the prior tells of '{m.sensor}', in whose frame all numbers are; choose another sensor with --base"
+            )
+
+
+def information(T: Array, names: Sequence[str], prior: Sequence[Measured]) -> tuple[Array, Array]:
+    """What the numbers say of poses T (n, 4, 4): information (6(n-1),) squared and gradient (6(n-1),).
+
+    Of ``(dt, delta)`` of each sensor but the base, base axes.
+    """
+    size = 6 * (len(T) - 1)
+    total, pull = np.zeros((size, size)), np.zeros(size)
+    for m in prior:
+        if m.parameter not in NUMBERS:
+            continue
+        i, k = names.index(m.sensor), NUMBERS.index(m.parameter)
+        error = m.value - _numbers(T[i], np.zeros(6))[k]
+        if k >= 3:
+            error = (error + np.pi) % (2 * np.pi) - np.pi
+        slope = np.zeros(size)
+        slope[6 * (i - 1) : 6 * i] = delta.jacobian(partial(_numbers, T[i]), np.zeros(6))[k]
+        total += np.outer(slope, slope) / m.sigma**2
+        pull += slope * error / m.sigma**2
+    return total, pull
+
+
+def late(prior: Sequence[Measured], names: Sequence[str], clocks: Clocks) -> list[Late]:
+    """What the numbers say of clocks."""
+    found = [m for m in prior if m.parameter == "dt"]
+    return [Late(int(clocks.of[names.index(m.sensor)]), m.value, m.sigma) for m in found]
+
+
+def unheld(directions: Array, information: Array) -> Array:
+    """(6, j) of the untold directions (6, k) of a sensor, in ``verdict.UNITS``, those that no number holds.
+
+    information: (6, 6) of the numbers on ``(dt, delta)``.
+    """
+    seen = directions * verdict.UNITS[:, None]
+    values, vectors = np.linalg.eigh(seen.T @ information @ seen)
+    return directions @ vectors[:, values < 1 / HELD**2]
+
+
+def _numbers(T: Array, moved: Array) -> Array:
+    """(6,) of a pose, moved by ``(dt, delta)``."""
+    angles = Rotation.from_matrix(se3.exp_so3(moved[3:]) @ T[:3, :3]).as_euler("ZYX")[::-1]
+    return np.concatenate([T[:3, 3] + moved[:3], angles])

@@ -1,0 +1,51 @@
+"""Motions made ready: in order of time, and no more often than the motion of a vehicle needs."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_toolkit import se3
+from calib_toolkit.types import Motions
+
+Array = NDArray[np.float64]
+
+OFTEN = 0.05
+"""Seconds below which the readings of a sensor with scale are joined: their errors are hardly independent."""
+
+
+def ready(motions: Motions) -> Motions:
+    """In order of time; those of a sensor that is read at over 20 Hz joined, as many as make a twentieth second."""
+    m = motions[np.argsort(motions.start, kind="stable")]
+    period = float(np.median(m.end - m.start))
+    together = round(OFTEN / max(period, 1e-4))
+    return joined(m, together) if m.has_scale and together > 1 else m
+
+
+def joined(m: Motions, together: int) -> Motions:
+    """So many successive motions as one each, except across gaps. The last of a run may be fewer.
+
+    Their errors are taken as independent.
+    """
+    gap = np.concatenate([[True], np.abs(m.start[1:] - m.end[:-1]) > 1e-6])
+    first = np.flatnonzero(gap)
+    place = np.arange(len(m)) - first[np.cumsum(gap) - 1]
+    begins = np.flatnonzero(place % together == 0)
+    ends = np.append(begins[1:], len(m))
+    vec, cov = m.vec[begins], m.cov[begins]
+    for k in range(1, together):
+        more = np.flatnonzero(begins + k < ends)
+        vec[more], cov[more] = _then(vec[more], cov[more], m.vec[begins[more] + k], m.cov[begins[more] + k])
+    return Motions(m.start[begins], m.end[ends - 1], vec, cov, m.has_scale)
+
+
+def _then(vec_a: Array, cov_a: Array, vec_b: Array, cov_b: Array) -> tuple[Array, Array]:
+    """One motion (n, 6) after another, with covariance (n, 6, 6)."""
+    vec = se3.vector(se3.matrix(vec_a) @ se3.matrix(vec_b))
+    R_a = se3.exp_so3(vec_a[:, 3:])
+    J_a, J_b = se3.vec_jacobian(vec_a), se3.vec_jacobian(vec_b)
+    by_a, by_b = np.zeros((2, len(vec), 6, 6))
+    by_a[:, :3, :3] = by_a[:, 3:, 3:] = np.eye(3)
+    by_a[:, :3, 3:] = -se3.skew((R_a @ vec_b[:, :3, None])[..., 0])
+    by_b[:, :3, :3] = by_b[:, 3:, 3:] = R_a
+    to_vec = np.linalg.inv(se3.vec_jacobian(vec))
+    by_a, by_b = to_vec @ by_a @ J_a, to_vec @ by_b @ J_b
+    return vec, by_a @ cov_a @ np.swapaxes(by_a, 1, 2) + by_b @ cov_b @ np.swapaxes(by_b, 1, 2)

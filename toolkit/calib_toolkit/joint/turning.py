@@ -1,0 +1,269 @@
+"""How late each clock is and how each sensor is turned, from the rates of turn of all sensors at once.
+
+The base's rate of turn is a latent signal whose second difference is white (a Gaussian process); every sensor sees
+its integral over each of its own intervals, in its own axes and by its own clock. Rotations, offsets and skews
+maximise the likelihood with the signal integrated out. How rough the signal is, and how noisy each sensor, is found
+with them. Nothing is resampled, so nothing draws the stamps of two sensors together.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_toolkit import se3, sync
+from calib_toolkit.joint import noise, spread
+from calib_toolkit.joint.arrow import Arrow, Solved
+from calib_toolkit.joint.clocks import Clocks
+from calib_toolkit.joint.windows import Index, Windows, hats, reach
+from calib_toolkit.types import Motions
+
+Array = NDArray[np.float64]
+
+SPACING = 0.05
+"""Seconds between the knots of the signal."""
+STENCIL = np.array([1.0, -2.0, 1.0])
+SMOOTHEST = 1e-4
+"""Least roughness of the signal, in variances of a reading's rate: a vehicle at rest would leave it none."""
+ROUNDS = 40
+CLOSE = 0.01
+"""A step of so many sigma is the end; so is a change of scales by twice this share."""
+TURN, LATE, SKEW = 0.5, 1.0, 1e-3
+"""How far from its start, in radians, seconds and parts, something may end of which the drive tells nothing."""
+SURE = 5.0
+"""Sigma from which a clock is said to run at a speed of its own."""
+
+
+@dataclass(frozen=True)
+class Turning:
+    """R_base_sensor: (n, 3, 3). clocks: offsets and skews.
+
+    cov: (p, p) of the rotations (``delta``, base axes, 3 for each sensor but the base), then the offsets and then the
+    skews of the clocks but the base's. scale: (n,) of each sensor's stated variance. freedom: (n,) degrees of freedom
+    it is told from. rejected: (n,) share of the sensor's readings. rounds: until all stood still.
+    """
+
+    R_base_sensor: Array
+    clocks: Clocks
+    cov: Array
+    scale: Array
+    freedom: Array
+    rejected: Array
+    rounds: int
+
+    @property
+    def clock_cov(self) -> Array:
+        """Offsets, then skews, of the clocks but the base's, (2(q-1), 2(q-1))."""
+        k = 3 * (len(self.R_base_sensor) - 1)
+        return self.cov[k:, k:]
+
+
+@dataclass(frozen=True)
+class Late:
+    """An offset known beforehand. clock: which. dt, sigma: seconds."""
+
+    clock: int
+    dt: float
+    sigma: float
+
+
+def estimate(motions: Sequence[Motions], R: Array, clocks: Clocks, known: Sequence[Late] = ()) -> Turning:
+    """From a start that is right to a reading or so. motions: (n) in order of time. R: (n, 3, 3).
+
+    A clock gets a skew where the drive shows that it has one.
+    """
+    search = _Search(motions, R, clocks, known)
+    others = len(clocks) - 1
+    free = np.arange(search.parameters) < search.parameters - others
+    rounds, solved, correction = search.maximise(free)
+    step, cov = _step(solved, correction, np.ones_like(free))
+    own = ~free & (np.abs(step) > SURE * np.sqrt(np.diag(cov)))
+    if own.any():
+        rounds, solved, correction = search.maximise(free | own)
+    _, cov = _step(solved, correction, free | own)
+    wider = np.sqrt(spread.inflation(search.pulls(solved), search.stamps(), cov, cov, _groups(len(motions), others)))
+    cov = cov * np.outer(wider, wider)
+    rejected = np.array([np.mean(w == 0) for w in search.weights])
+    freedom = noise.freedoms(search.readings, search.kept)
+    return Turning(search.R, search.clocks, cov, search.scale, freedom, rejected, rounds)
+
+
+class _Search:
+    """Rounds of Gauss-Newton. R, clocks, rates (K, 3) of turn, roughness (3,), scale and weights as they stand."""
+
+    def __init__(self, motions: Sequence[Motions], R: Array, clocks: Clocks, known: Sequence[Late]) -> None:
+        n = len(motions)
+        self.motions, self.R, self.clocks, self.known, self.scale = motions, R.copy(), clocks, known, np.ones(n)
+        self.parameters = 3 * (n - 1) + 2 * (len(clocks) - 1)
+        ends = [(clocks.base_time(i, m.start).min(), clocks.base_time(i, m.end).max()) for i, m in enumerate(motions)]
+        self.first, last = min(a for a, _ in ends) - 10 * SPACING, max(b for _, b in ends) + 10 * SPACING
+        knots = np.arange(self.first, last + SPACING, SPACING)
+        self.reach = max(reach(max(float(np.max(m.end - m.start)) for m in motions), SPACING), len(STENCIL))
+        base = sync.chain(motions[0])
+        self.rates = base.turned.derivative()(np.clip(knots, base.knots[0], base.knots[-1] - 1e-9))
+        noise_of_rate = (
+            min(float(np.median(np.trace(m.cov[:, 3:, 3:], axis1=1, axis2=2))) for m in motions) / SPACING**2
+        )
+        self.smoothest = SMOOTHEST * noise_of_rate
+        self.rough = 0.3 * np.var(np.diff(self.rates, 2, axis=0), axis=0) + self.smoothest
+        self.weights = [np.ones(len(m)) for m in motions]
+        self.readings: list[noise.Readings] = []
+        self.kept: list[NDArray[np.bool_]] = []
+
+    def maximise(self, free: NDArray[np.bool_]) -> tuple[int, Solved, Array]:
+        """Rounds until nothing moves, the last equations, and the correction of their gradient. free: (p,)."""
+        for round_ in range(ROUNDS):
+            seen = [self.seen(i) for i in range(len(self.motions))]
+            solved = self.equations(seen).solved()
+            correction = self.correction(solved, seen)
+            step, cov = _step(solved, correction, free)
+            self.move(step, solved)
+            change = self.judge(round_, solved, seen, step)
+            still = np.max(np.abs(step[free]) / np.sqrt(np.diag(cov)[free]), initial=0.0) < CLOSE
+            if round_ > noise.SETTLING and still and np.max(np.abs(np.log(change))) < 2 * CLOSE:
+                break
+        return round_ + 1, solved, correction
+
+    def seen(self, i: int) -> "_Seen":
+        """Sensor i's readings against the signal, rotation and clock as they stand."""
+        m = self.motions[i]
+        a, b = self.clocks.base_time(i, m.start), self.clocks.base_time(i, m.end)
+        windows = hats(self.first, SPACING, len(self.rates), a, b, self.reach)
+        turned, later = windows.of(self.rates), windows.of(self.rates, windows.rate)
+        parts, columns = [], np.zeros(0, dtype=np.int64)
+        if i:
+            parts, columns = [self.R[i].T @ se3.skew(turned)], np.arange(3 * (i - 1), 3 * i)
+        since = (m.start + m.end) / 2 - self.clocks.t_ref
+        if c := int(self.clocks.of[i]):
+            by_late = (later @ self.R[i])[:, :, None]
+            parts += [by_late, by_late * since[:, None, None]]
+            columns = np.append(columns, self.clock_columns(c))
+        return _Seen(
+            windows,
+            m.vec[:, 3:] - turned @ self.R[i],
+            np.linalg.inv(m.cov[:, 3:, 3:] * self.scale[i]),
+            self.weights[i],
+            np.concatenate([*parts, np.zeros((len(m), 3, 0))], axis=2),
+            columns,
+            since,
+        )
+
+    def equations(self, seen: Sequence["_Seen"]) -> Arrow:
+        """Of all readings, the signal's smoothness, and what is known beforehand."""
+        turns, others = 3 * (len(self.motions) - 1), len(self.clocks) - 1
+        arrow = Arrow(len(self.rates), 3, self.reach, self.parameters)
+        for R, s in zip(self.R, seen, strict=True):
+            weight = s.weight * s.counted[:, None, None]
+            by_rate = np.broadcast_to(R.T, weight.shape)
+            arrow.add(s.windows, by_rate, weight, s.residual)
+            arrow.add_parameters(s.columns, s.by_parameter, s.windows, by_rate, weight, s.residual)
+        arrow.add_prior(STENCIL, self.rates, 1 / self.rough)
+        arrow.hold(0, 1e-9)
+        arrow.hold(len(self.rates) - 1, 1e-9)
+        arrow.information += np.diag(1 / np.repeat([TURN, LATE, SKEW], [turns, others, others]) ** 2)
+        for k in self.known:
+            column = self.clock_columns(k.clock)[0]
+            arrow.information[column, column] += 1 / k.sigma**2
+            arrow.gradient[column] += (k.dt - self.clocks.dt[k.clock]) / k.sigma**2
+        return arrow
+
+    def correction(self, solved: Solved, seen: Sequence["_Seen"]) -> Array:
+        """(p,) what the fitted signal pulls at the clocks and the likelihood with it integrated out does not.
+
+        A signal is fitted best where that costs least, which depends on how the sensors' stamps lie to each other.
+        """
+        correction = np.zeros(self.parameters)
+        for i, s in enumerate(seen):
+            if c := int(self.clocks.of[i]):
+                weight = se3.rotate_cov(self.R[i], s.weight * s.counted[:, None, None])
+                pull = np.einsum("nij,nji->n", weight, solved.covariance(s.windows, s.windows.rate))
+                correction[self.clock_columns(c)] += [pull.sum(), pull @ s.since]
+        return correction
+
+    def judge(self, round_: int, solved: Solved, seen: Sequence["_Seen"], step: Array) -> Array:
+        """Bring weights, scales and the signal's roughness up to date; (n,) by what the scales were wrong."""
+        moved = solved.latents(step)
+        self.readings = []
+        for R, s in zip(self.R, seen, strict=True):
+            left = s.residual - s.windows.of(moved) @ R - s.by_parameter @ step[s.columns]
+            squared = np.einsum("ni,nij,nj->n", left, s.weight, left)
+            share = np.einsum("nij,nji->n", se3.rotate_cov(R, s.weight), solved.covariance(s.windows))
+            expected = noise.expected(3, share, s.counted)
+            self.readings.append(noise.Readings(squared, expected, 3, np.ones(len(squared), dtype=bool)))
+        before, self.weights = self.weights, [noise.weights(r, round_) for r in self.readings]
+        self.kept = [(a > 0) & (b > 0) for a, b in zip(before, self.weights, strict=True)]
+        change = noise.ratios(self.readings, self.kept, round_, self.scale)
+        self.scale = self.scale * noise.damped(change, round_)
+        self.rough = np.maximum(self.rough * self.rougher(solved), self.smoothest)
+        return change
+
+    def pulls(self, solved: Solved) -> list[Array]:
+        """(n) of (m, p) each reading's part of the gradient, the signal following."""
+        found = []
+        for i, R in enumerate(self.R):
+            s = self.seen(i)
+            by_parameter = -np.swapaxes(R[None], 1, 2) @ s.windows.of(solved.response)
+            by_parameter[:, :, s.columns] += s.by_parameter
+            weight = s.weight * s.counted[:, None, None]
+            found.append(np.einsum("ndp,nde,ne->np", by_parameter, weight, s.residual))
+        return found
+
+    def stamps(self) -> list[Array]:
+        """(n) of (m,) base time of each reading."""
+        return [self.clocks.base_time(i, m.start) for i, m in enumerate(self.motions)]
+
+    def rougher(self, solved: Solved) -> Array:
+        """(3,) by which the signal's second differences are larger than their variance says."""
+        k = np.arange(len(self.rates) - len(STENCIL) + 1)
+        stencils = np.broadcast_to(STENCIL, (len(k), len(STENCIL)))
+        known = len(k) - np.einsum("kii->i", solved.covariance(Windows(k, stencils, stencils))) / self.rough
+        second = (np.diff(self.rates, 2, axis=0) ** 2).sum(axis=0)
+        return np.clip(second / np.maximum(known, 1.0) / self.rough, 0.2, 5.0)
+
+    def move(self, step: Array, solved: Solved) -> None:
+        """By a step of the parameters, and the signal with it."""
+        turns, others = 3 * (len(self.motions) - 1), len(self.clocks) - 1
+        self.rates = self.rates + solved.latents(step)
+        self.R[1:] = se3.exp_so3(step[:turns].reshape(-1, 3)) @ self.R[1:]
+        late, skew = step[turns : turns + others], step[turns + others :]
+        self.clocks = self.clocks.moved(np.append(0.0, late), np.append(0.0, skew))
+
+    def clock_columns(self, clock: int) -> list[int]:
+        """Where a clock's offset and skew are among the parameters."""
+        turns, others = 3 * (len(self.motions) - 1), len(self.clocks) - 1
+        return [turns + clock - 1, turns + others + clock - 1]
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """One sensor's readings in one round.
+
+    residual: (m, 3), weight: (m, 3, 3) in the sensor's axes. counted: (m,) how much each counts. by_parameter:
+    (m, 3, q) for columns (q,). since: (m,) seconds from the instant that skews are about.
+    """
+
+    windows: Windows
+    residual: Array
+    weight: Array
+    counted: Array
+    by_parameter: Array
+    columns: Index
+    since: Array
+
+
+def _groups(sensors: int, others: int) -> list[Index]:
+    """Parameters that are one thing: each rotation, and each clock."""
+    turns = 3 * (sensors - 1)
+    return [*np.split(np.arange(turns), sensors - 1), *(turns + np.array([[c, others + c] for c in range(others)]))]
+
+
+def _step(solved: Solved, correction: Array, free: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """The next step (p,) and the covariance (p, p) of the parameters that are free; zero for the others."""
+    p = len(free)
+    step, cov = np.zeros(p), np.zeros((p, p))
+    if free.any():
+        inside = np.ix_(free, free)
+        cov[inside] = np.linalg.inv(solved.information[inside])
+        step[free] = cov[inside] @ (solved.gradient - correction)[free]
+    return step, cov
