@@ -1,4 +1,4 @@
-"""Whether the joint estimator's sigmas hold: the experiments of docs/results/statistics.py on few rigs.
+"""Whether the joint estimator's sigmas hold: the experiments of docs/results/honesty.py on few rigs.
 
 Bounds are those of the experiments, widened for how few rigs there are.
 """
@@ -21,7 +21,7 @@ def lab():
     """The experiments' modules; their folder comes last, for one of them is named like Python's own statistics."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "path", [*sys.path, str(FOLDER)])
-        spec = importlib.util.spec_from_file_location("experiments", FOLDER / "statistics.py")
+        spec = importlib.util.spec_from_file_location("experiments", FOLDER / "honesty.py")
         experiments = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(experiments)
         names = ("bound", "failures", "rigs", "summaries")

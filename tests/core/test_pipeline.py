@@ -21,7 +21,7 @@ SENSORS = [
     SimulatedSensor("cam", CAMERA, dt=-0.05, has_scale=False),
 ]
 STREET, ROUGH = path(60, 0, "street"), path(60, 0, "rough")
-QUICK = Config(jobs=1, timing=TimingOptions(steps=2000))
+QUICK = Config(method="paper", jobs=1, timing=TimingOptions(steps=2000))
 
 
 def log_of(true, sensors=SENSORS, seed=0):

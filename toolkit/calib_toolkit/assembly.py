@@ -78,10 +78,17 @@ def calibration(
 
 
 def with_unknown(names: Sequence[str], undetermined: Sequence[Undetermined], cov: Array) -> Array:
-    """A covariance (7n, 7n) with ``ANYTHING`` along directions that are not determined."""
+    """A covariance (7n, 7n) with ``ANYTHING`` along directions that are not determined.
+
+    A direction that turns and shifts is the beginning of an arc, which so far away has left the straight line.
+    """
     for u in undetermined:
         vector = _vector(names, u)
         cov = cov + np.outer(vector, vector)
+        parts = vector.reshape(-1, 7)
+        bent = np.zeros_like(parts)
+        bent[:, :3] = np.cross(parts[:, 3:6], parts[:, :3]) / 2
+        cov = cov + np.outer(bent, bent)
     return cov
 
 

@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from calib_toolkit import sync
-from calib_toolkit.errors import DataError, NotObservableError
-from calib_toolkit.types import Motions, Undetermined
+from calib_toolkit.errors import ConfigError, DataError, NotObservableError
+from calib_toolkit.types import Measured, Motions, Undetermined
 
 LARGEST_VEHICLE = 20.0
 """Metres: no two sensors are further apart."""
@@ -65,7 +65,7 @@ def turning(names: Sequence[str], unknown: Sequence[Undetermined]) -> None:
     open_directions = [key.rpartition(".")[0] for u in unknown for key in list(u.direction)[:1]]
     if all(open_directions.count(name) == 3 for name in names[1:]):
         raise NotObservableError(
-            "the vehicle hardly turned in this part of the drive, so nothing can be told of how the sensors sit; "
+            "the vehicle hardly turned in this part of the drive, so nothing can be told of how sensors sit; "
             "drive bends to both sides, and a ramp, kerbs or rough ground"
         )
 
@@ -73,6 +73,12 @@ def turning(names: Sequence[str], unknown: Sequence[Undetermined]) -> None:
 def still() -> None:
     """Refuse a drive on which the vehicle stood."""
     raise NotObservableError(
-        "the vehicle hardly moved in this part of the drive, so nothing can be told of how the sensors sit; drive "
-        "bends to both sides, and a ramp, kerbs or rough ground"
+        "the vehicle hardly moved or turned in this part of the drive, so nothing can be told of how sensors sit; "
+        "drive bends to both sides, and a ramp, kerbs or rough ground"
     )
+
+
+def without_prior(prior: Sequence[Measured]) -> None:
+    """Refuse measured numbers, which the paper's method has no place for."""
+    if prior:
+        raise ConfigError("the paper's method takes no measured numbers; leave out --prior, or choose --method joint")

@@ -27,13 +27,16 @@ COMMON = 0.3
 """Least correlation of two sensors' readings along a direction: below it noise biases what is estimated there."""
 
 
-def unmeasured_times(names: Sequence[str], chains: Sequence[Chain], clocks: Sequence[Hashable]) -> list[Undetermined]:
+def unmeasured_times(
+    names: Sequence[str], chains: Sequence[Chain], clocks: Sequence[Hashable], periods: int = 1
+) -> list[Undetermined]:
     """Sensors on clocks of which none's angular speed changes together with the first sensor's.
 
-    chains: (n,) on one clock. clocks: (n,) sensors with equal ones share an offset.
+    chains: (n,) on one clock. clocks: (n,) sensors with equal ones share an offset. periods: of the slowest sensor,
+    over which a speed is told.
     """
     lo, hi = common_span(chains)
-    window = max(c.period for c in chains)
+    window = periods * max(c.period for c in chains)
     angle, _ = angles(chains, np.arange(lo, hi - window, window), window)
     slope = np.diff(angle, axis=1)
     known = np.isfinite(slope).all(axis=0)
@@ -178,6 +181,7 @@ def _direction(name: str, axes: tuple[str, str, str], v: Array) -> dict[str, flo
 
 
 def axis_words(v: Array, base: str) -> str:
+    """A unit vector (3,) in the base's axes, by the name of the axis that it is along if it is."""
     largest = int(np.argmax(np.abs(v)))
     if abs(v[largest]) > 0.95:
         return f"{'xyz'[largest]} of {base}"

@@ -20,6 +20,7 @@ def calibrate(motions: Mapping[str, Motions], config: Config, clocks: Sequence[s
 
     Raises CalibrationError.
     """
+    checks.without_prior(config.prior)
     progress.begin(STAGES, 3)
     names = tuple(motions)
     chains, offsets, unknown_times = _times(motions, config, clocks)

@@ -76,7 +76,8 @@ def calibrate_motions(
     """
     config = config or Config()
     found = METHODS[config.method].calibrate(motions, config, clocks or tuple(motions), progress or Silent())
-    return replace(found, warnings=tuple(warnings), configuration=asdict(config))
+    chosen = {**asdict(config), "prior": [asdict(m) for m in config.prior]}
+    return replace(found, warnings=tuple(warnings), configuration=chosen)
 
 
 def clock_offsets(

@@ -8,11 +8,14 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
+from scipy.linalg.blas import dtrsm
 
 from calib_toolkit.joint.windows import Index, Windows
 
 Array = NDArray[np.float64]
+
+CHUNK = 4096
+"""Readings whose latents are looked up at once."""
 
 
 class Arrow:
@@ -58,13 +61,13 @@ class Arrow:
         self._cross[:, :, columns] += summed
 
     def add_prior(self, stencil: Array, latents: Array, precision: Array) -> None:
-        """A difference of neighbouring latents (size, width) is about zero. stencil: (s,). precision: (width,)."""
+        """A difference of neighbouring latents is about zero. stencil: (s,). precision: (width, width)."""
         n = self.size - len(stencil) + 1
-        off = sum(c * latents[j : j + n] for j, c in enumerate(stencil))
+        off = np.sum([c * latents[j : j + n] for j, c in enumerate(stencil)], axis=0)
         for j, a in enumerate(stencil):
-            self._pull[j : j + n] -= a * precision * off
+            self._pull[j : j + n] -= a * off @ precision
             for k in range(j + 1):
-                self._band[k : k + n, j - k] += a * stencil[k] * np.diag(precision)
+                self._band[k : k + n, j - k] += a * stencil[k] * precision
 
     def hold(self, knot: int, precision: float) -> None:
         """Keep one latent about where it is."""
@@ -106,7 +109,7 @@ class Solved:
         left = rng.normal(size=(len(L), L.shape[1], 1))
         for k in range(len(L) - 1, -1, -1):
             behind = left[k] if k == len(C) else left[k] - C[k].T @ left[k + 1]
-            left[k] = solve_triangular(L[k], behind, lower=True, trans=1, check_finite=False)
+            left[k] = _backward(L[k], behind)
         return left.reshape(-1, self._width)[: self._size]
 
     def covariance(self, windows: Windows, left: Array | None = None) -> Array:
@@ -114,55 +117,55 @@ class Solved:
 
         left: other weights (n, m) of the side that is written first.
         """
-        right = windows.weights
+        right, d = windows.weights, self._width
         left = right if left is None else left
-        out = np.zeros((len(right), self._width, self._width))
-        for j in range(right.shape[1]):
-            for k in range(j + 1):
-                block = self._between(windows.first + j, windows.first + k)
-                out += (left[:, j] * right[:, k])[:, None, None] * block
-                if k < j:
-                    out += (left[:, k] * right[:, j])[:, None, None] * np.swapaxes(block, 1, 2)
+        n, m = right.shape
+        left, right = ((w[:, :, None, None] * np.eye(d)).reshape(n, m * d, d) for w in (left, right))
+        out = np.empty((n, d, d))
+        for part in (slice(k, k + CHUNK) for k in range(0, n, CHUNK)):
+            block, place = np.divmod(windows.first[part], self._per)
+            at = (place * d)[:, None] + np.arange(m * d)
+            near = self._inverse[block[:, None, None], at[:, :, None], at[:, None, :]]
+            out[part] = np.swapaxes(left[part], 1, 2) @ (near @ right[part])
         return out
 
     @cached_property
-    def _inverse(self) -> tuple[Array, Array]:
-        """The blocks of the band's inverse on and below the diagonal (Takahashi's recursion)."""
+    def _inverse(self) -> Array:
+        """(n, 2b, 2b) of the band's inverse, each block of latents with the next one (Takahashi's recursion)."""
         L, C = self._factors
-        diagonal, below = np.empty_like(L), np.empty_like(C)
-        eye = np.eye(L.shape[1])
-        for k in range(len(L) - 1, -1, -1):
-            inner = solve_triangular(L[k], eye, lower=True, check_finite=False)
-            diagonal[k] = inner.T @ inner
-            if k < len(C):
+        n, b, _ = L.shape
+        found, eye = np.zeros((n, 2 * b, 2 * b)), np.eye(b)
+        for k in range(n - 1, -1, -1):
+            inner = _forward(L[k], eye)
+            own = inner.T @ inner
+            if k < n - 1:
                 through = C[k] @ inner
-                below[k] = -diagonal[k + 1] @ through
-                diagonal[k] += through.T @ diagonal[k + 1] @ through
-        return diagonal, below
-
-    def _between(self, a: Index, b: Index) -> Array:
-        """(n, width, width) covariance of latents a with b, a not before b and at most a block after."""
-        per, d = self._per, self._width
-        diagonal, below = (m.reshape(len(m), per, d, per, d) for m in self._inverse)
-        out = np.empty((len(a), d, d))
-        same = a // per == b // per
-        i, j = a[same], b[same]
-        out[same] = diagonal[i // per, i % per, :, j % per, :]
-        i, j = a[~same], b[~same]
-        out[~same] = below[j // per, i % per, :, j % per, :]
-        return out
+                later = found[k + 1, :b, :b]
+                below = -later @ through
+                own -= through.T @ below
+                found[k, b:, b:], found[k, b:, :b], found[k, :b, b:] = later, below, below.T
+            found[k, :b, :b] = own
+        return found
 
     def _solve(self, rhs: Array) -> Array:
         """The band's system for (padded, width, q) right-hand sides."""
         L, C = self._factors
         y = rhs.reshape(len(L), L.shape[1], -1).copy()
         for k in range(len(L)):
-            left = y[k] - C[k - 1] @ y[k - 1] if k else y[k]
-            y[k] = solve_triangular(L[k], left, lower=True, check_finite=False)
+            y[k] = _forward(L[k], y[k] - C[k - 1] @ y[k - 1] if k else y[k])
         for k in range(len(L) - 1, -1, -1):
-            left = y[k] - C[k].T @ y[k + 1] if k < len(C) else y[k]
-            y[k] = solve_triangular(L[k], left, lower=True, trans=1, check_finite=False)
+            y[k] = _backward(L[k], y[k] - C[k].T @ y[k + 1] if k < len(C) else y[k])
         return y.reshape(rhs.shape)
+
+
+def _forward(L: Array, rhs: Array) -> Array:
+    """``L x = rhs``, without what a checked call costs: it is made once for each block."""
+    return np.asarray(dtrsm(1.0, L.T, rhs.T, side=1, lower=0).T)
+
+
+def _backward(L: Array, rhs: Array) -> Array:
+    """``L^T x = rhs``."""
+    return np.asarray(dtrsm(1.0, L.T, rhs.T, side=1, lower=0, trans_a=1).T)
 
 
 def _scatter(into: Array, index: Index, values: Array) -> None:
@@ -196,5 +199,5 @@ def _factorise(diagonal: Array, below: Array) -> tuple[Array, Array]:
         left = diagonal[k] - C[k - 1] @ C[k - 1].T if k else diagonal[k]
         L[k] = np.linalg.cholesky(left)
         if k < len(C):
-            C[k] = solve_triangular(L[k], below[k].T, lower=True, check_finite=False).T
+            C[k] = _forward(L[k], below[k].T).T
     return L, C

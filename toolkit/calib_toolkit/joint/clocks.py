@@ -1,6 +1,6 @@
 """Clocks that are late and run at a slightly different speed."""
 
-from collections.abc import Collection, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,7 +43,6 @@ class Clocks:
         """By so much (q,) each."""
         return replace(self, dt=self.dt + dt, skew=self.skew + skew)
 
-    def without(self, open_: Collection[int]) -> "Clocks":
-        """Those clocks taken as they are."""
-        told = np.array([c not in open_ for c in range(len(self))], dtype=float)
-        return replace(self, dt=self.dt * told, skew=self.skew * told)
+    def within(self, other: "Clocks", most: float) -> "Clocks":
+        """No further than so many seconds from others."""
+        return replace(self, dt=np.clip(self.dt, other.dt - most, other.dt + most))

@@ -10,7 +10,7 @@ from scipy.linalg import block_diag, null_space
 
 from calib_toolkit import assembly, checks, observability, se3, sync
 from calib_toolkit.config import Config
-from calib_toolkit.joint import moving, prior, report, spread, start, turning, verdict
+from calib_toolkit.joint import moving, prior, report, spread, start, told, turning, verdict
 from calib_toolkit.joint.clocks import Clocks
 from calib_toolkit.joint.readings import ready
 from calib_toolkit.progress import Progress
@@ -27,24 +27,26 @@ GATE = 100.0
 
 @dataclass(frozen=True)
 class Timed:
-    """What the first stage leaves: motions in order, clocks (zero where nothing told), common steps, a first guess of
-    the poses T (n, 4, 4), and the clocks that nothing told, in words.
+    """What the first stage leaves: motions in order, turns, clocks, common steps, and a first guess of the poses T
+    (n, 4, 4).
     """
 
     names: tuple[str, ...]
     motions: list[Motions]
     turned: turning.Turning
-    clocks: Clocks
+    told: told.Told
     steps: sync.Steps
     T: Array
-    unknown: list[Undetermined]
 
     @property
-    def clock_cov(self) -> Array:
-        """Offsets, then skews, of the clocks but the base's; zero for those that nothing told."""
-        open_ = {int(self.clocks.of[self.names.index(_sensor(u))]) for u in self.unknown}
-        told = np.tile([float(c not in open_) for c in range(1, len(self.clocks))], 2)
-        return self.turned.clock_cov * np.outer(told, told)
+    def clocks(self) -> Clocks:
+        """As far as the drive tells them."""
+        return self.told.clocks
+
+    @property
+    def unknown(self) -> list[Undetermined]:
+        """Clocks that nothing told, in words."""
+        return [verdict.clock(name) for name, c in zip(self.names, self.clocks.of, strict=True) if self.told.open[c]]
 
 
 @dataclass(frozen=True)
@@ -89,18 +91,11 @@ def _time(motions: Mapping[str, Motions], clocks: Sequence[str], known: Sequence
     middle = float(np.mean(chains[0].knots[[0, -1]]))
     first = Clocks.starting(clocks, start.lags(chains), middle)
     steps = _steps(names, chains, first)
-    turned = turning.estimate(in_order, start.poses(steps)[:, :3, :3], first, prior.late(known, names, first))
-    on_base = [c.shifted(turned.clocks.dt[k]) for c, k in zip(chains, turned.clocks.of, strict=True)]
-    told = {m.sensor for m in known if m.parameter == "dt"}
-    unknown = [
-        u
-        for u in observability.unmeasured_times(names, on_base, clocks)
-        if not any(clocks[names.index(t)] == clocks[names.index(_sensor(u))] for t in told)
-    ]
-    open_ = {int(turned.clocks.of[names.index(_sensor(u))]) for u in unknown}
-    late = turned.clocks.without(open_)
-    steps = _steps(names, chains, late)
-    return Timed(names, in_order, turned, late, steps, start.poses(steps), unknown)
+    late = prior.late(known, names, first)
+    turned = turning.estimate(in_order, start.poses(steps)[:, :3, :3], first, late)
+    clocks_told = told.estimate(in_order, turned, late)
+    steps = _steps(names, chains, clocks_told.clocks)
+    return Timed(names, in_order, turned, clocks_told, steps, start.poses(steps))
 
 
 def _turn(timed: Timed) -> Placed:
@@ -110,10 +105,12 @@ def _turn(timed: Timed) -> Placed:
     cov = np.zeros((6 * (n - 1) + q, 6 * (n - 1) + q))
     at = (6 * np.arange(n - 1)[:, None] + np.arange(3, 6)).ravel()
     cov[np.ix_(at, at)] = timed.turned.cov[: 3 * (n - 1), : 3 * (n - 1)]
-    cov[6 * (n - 1) :, 6 * (n - 1) :] = timed.clock_cov
+    cov[6 * (n - 1) :, 6 * (n - 1) :] = timed.told.cov
     T = se3.rigid(timed.turned.R_base_sensor, np.zeros((n, 3)))
     unscaled = replace(timed.steps, has_scale=np.zeros(n, dtype=bool))
     open_ = [verdict.turns(directions) for directions in verdict.untold(unscaled, T)]
+    if not timed.steps.has_scale.any() and all(directions.shape[1] == 3 for directions in open_):
+        checks.still()
     return Placed(T, cov, _unknown(timed, open_, cov), None)
 
 
@@ -121,7 +118,7 @@ def _place(timed: Timed, known: Sequence[Measured]) -> Placed:
     """All poses, what nothing tells of them left where it is."""
     names, T = timed.names, timed.T.copy()
     # where nothing is told, noise may have put a sensor anywhere, which would turn the directions that are left
-    T[1:, :3, 3] -= [verdict.shifts(v) @ t for v, t in zip(verdict.untold(timed.steps, T), T[1:, :3, 3], strict=True)]
+    T[1:] = [verdict.nearest(*both) for both in zip(T[1:], verdict.untold(timed.steps, T), strict=True)]
     open_ = [
         prior.unheld(directions, prior.information(T, names, known)[0][6 * k : 6 * k + 6, 6 * k : 6 * k + 6])
         for k, directions in enumerate(verdict.untold(timed.steps, T))
@@ -145,7 +142,7 @@ def _place(timed: Timed, known: Sequence[Measured]) -> Placed:
     wider = np.sqrt(spread.inflation(found.pulls, stamps, gain, cov, groups))
     cov = cov * np.outer(wider, wider)
     # a clock that is off by some time moves the poses with it
-    poses, clock_cov = 6 * (len(names) - 1), timed.clock_cov
+    poses, clock_cov = 6 * (len(names) - 1), timed.told.cov
     cov, moved = cov[:poses, :poses], (-gain @ found.by_clock)[:poses]
     joint = np.block([[cov + moved @ clock_cov @ moved.T, moved @ clock_cov], [clock_cov @ moved.T, clock_cov]])
     return Placed(found.T_base_sensor, joint, _unknown(timed, open_, joint), found)
@@ -194,7 +191,7 @@ def _calibration(timed: Timed, placed: Placed) -> Calibration:
 def _offsets(timed: Timed) -> Calibration:
     """The clocks alone."""
     n = len(timed.names)
-    cov = block_diag(np.zeros((6 * (n - 1), 6 * (n - 1))), timed.clock_cov)
+    cov = block_diag(np.zeros((6 * (n - 1), 6 * (n - 1))), timed.told.cov)
     found = _calibration(timed, Placed(np.broadcast_to(np.eye(4), (n, 4, 4)), cov, [], None))
     known = found.determined.copy()
     known[1:, 3:6] = False
@@ -228,11 +225,9 @@ def _free(open_: Sequence[Array], biased: Sequence[Array]) -> Array:
 
 def _steps(names: Sequence[str], chains: Sequence[sync.Chain], clocks: Clocks) -> sync.Steps:
     """Common steps by clocks about right."""
-    steps = sync.synchronise([c.shifted(clocks.dt[k]) for c, k in zip(chains, clocks.of, strict=True)], GATE)
+    on_base = [c.shifted(clocks.dt[k]) for c, k in zip(chains, clocks.of, strict=True)]
+    checks.overlap(names, on_base, 0.0)
+    steps = sync.synchronise(on_base, GATE)
     checks.steps(steps)
     checks.lengths(names, steps)
     return steps
-
-
-def _sensor(u: Undetermined) -> str:
-    return next(iter(u.direction)).rpartition(".")[0]

@@ -17,7 +17,7 @@ from calib_toolkit.joint import noise
 from calib_toolkit.joint.arrow import Arrow, Solved
 from calib_toolkit.joint.clocks import Clocks
 from calib_toolkit.joint.model import Linear, linear, read
-from calib_toolkit.joint.windows import Index, Windows, splines
+from calib_toolkit.joint.windows import Index, Windows, coning, splines
 from calib_toolkit.types import Motions
 
 Array = NDArray[np.float64]
@@ -27,6 +27,8 @@ Prior = Callable[[Array], tuple[Array, Array]]
 STENCIL = np.array([-1.0, 3.0, -3.0, 1.0])
 LOOSE = 100.0
 """The signal's third differences may vary by so many times what they do: felt in gaps only."""
+SLIGHT = 1e-9
+"""Least weight of that, in weights of a reading: arithmetic needs some."""
 LEAST_TRAVEL = 6.0
 """Sigma of a base's reading that the base must travel for the direction of a sensor without scale to count."""
 NOTHING = 1e6
@@ -39,7 +41,7 @@ FAR = 30.0
 """Metres or radians: what the drive tells nothing of is no further from where it started."""
 ROUNDS = 30
 CLOSE = 0.01
-DRAWS = 4
+DRAWS = 2
 """Of the motion's error, to tell what noise feigns."""
 
 
@@ -120,13 +122,13 @@ class _Search:
         base = sync.chain(motions[0])
         breaks = _breaks(base, min(a.min() for a, _ in spans), max(b.max() for _, b in spans))
         knots = np.concatenate([np.repeat(breaks[0], 3), breaks, np.repeat(breaks[-1], 3)])
-        longest = max(float(np.max(b - a)) for a, b in spans)
-        reach = min(int(np.ceil(longest / np.diff(breaks).min())) + 4, len(knots) - 4)
-        self.windows = [splines(knots, a, b, reach) for a, b in spans]
-        self.reach = reach
+        self.windows = [splines(knots, a, b) for a, b in spans]
+        self.more = [coning(base, a, b) for a, b in spans]
+        self.reach = max(len(STENCIL), *(w.weights.shape[1] for w in self.windows))
         middles = np.clip((knots[1:-3] + knots[2:-2] + knots[3:-1]) / 3, base.knots[0], base.knots[-1] - 1e-9)
         self.twists = base.summed(middles)
-        self.loose = LOOSE * np.var(np.diff(self.twists, 3, axis=0), axis=0) + 1e-12
+        least = SLIGHT / np.median(np.einsum("nii->ni", motions[0].cov), axis=0)
+        self.hold = np.maximum(1 / (LOOSE * np.var(np.diff(self.twists, 3, axis=0), axis=0) + 1e-12), least)
         sigma = np.sqrt(np.median(np.trace(motions[0].cov[:, :3, :3], axis1=1, axis2=2)) / 3)
         self.far = [
             np.full(len(m), m.has_scale) | (_travel(base, a, b) > LEAST_TRAVEL * sigma)
@@ -162,7 +164,7 @@ class _Search:
         arrow.gradient[poses] += pull
         arrow.information[biases, biases] += np.eye(len(self.free) - len(pull)) / BIASED**2
         arrow.gradient[biases] -= self.bias[1:].ravel() / BIASED**2
-        arrow.add_prior(STENCIL, self.twists, 1 / self.loose)
+        arrow.add_prior(STENCIL, self.twists, np.diag(self.hold))
         arrow.hold(0, 1e6)
         return arrow
 
@@ -179,7 +181,8 @@ class _Search:
             whole.append(_readings(r, left, fitted, counted, left.shape[1]))
             shifts = _readings(r, left, fitted, counted, left.shape[1] - 3)
             self.shifts.append(replace(shifts, usable=shifts.usable & far))
-        before, self.weights = self.weights, [noise.weights(r, round_) for r in whole]
+        before = self.weights
+        self.weights = [noise.weights(r, round_, w) for r, w in zip(whole, before, strict=True)]
         self.kept = [(a > 0) & (b > 0) & s.usable for a, b, s in zip(before, self.weights, self.shifts, strict=True)]
         change = noise.ratios(self.shifts, self.kept, round_, self.scale)
         self.scale = self.scale * noise.damped(change, round_)
@@ -201,7 +204,7 @@ class _Search:
     def seen(self, i: int) -> _Seen:
         """Sensor i's readings against the motion and its pose as they stand."""
         m, windows = self.motions[i], self.windows[i]
-        twist = windows.of(self.twists)
+        twist = windows.of(self.twists) + self.more[i]
         spread = np.sqrt(np.repeat([self.scale[i], self.turn_scale[i]], 3))
         cov = m.cov * spread[:, None] * spread
         reading = linear(self.T[i], self.bias[i], twist, m.vec, cov, m.has_scale)

@@ -17,8 +17,10 @@ Mask = NDArray[np.bool_]
 
 TRUSTED = 0.9999
 """Share of good readings that the gate lets through."""
-SETTLING = 6
+SETTLING = 4
 """Rounds in which readings are weighed by how well they fit."""
+LATE = 12
+"""Rounds after which no reading that was rejected comes back."""
 FREEDOM = 4.0
 """Of the Student's t."""
 STATED = 20.0
@@ -27,7 +29,7 @@ VISIBLE = 100.0
 """Residual degrees of freedom from which a sensor's noise can be told by itself."""
 LEVERAGE = 0.5
 """Least share of a residual that is taken to be left by the fit: less would make a small fault of the model large."""
-DAMPED = 0.5
+DAMPED = 0.7
 
 
 @dataclass(frozen=True)
@@ -53,12 +55,14 @@ def expected(size: int, fitted: Array, weight: Array) -> Array:
     return size + (1 - 2 * weight) * fitted
 
 
-def weights(readings: Readings, round_: int) -> Array:
-    """(n,) from 0 to 1: how much each reading counts in the next round."""
+def weights(readings: Readings, round_: int, before: Array) -> Array:
+    """(n,) from 0 to 1: how much each reading counts in the next round. before: (n,) and in this one."""
     fit = readings.squared * readings.size / np.maximum(readings.expected, LEVERAGE * readings.size)
     if round_ < SETTLING:
         return np.where(readings.usable, np.minimum(1.0, (FREEDOM + readings.size) / (FREEDOM + fit)), 0.0)
-    return (readings.usable & (fit < chi2.ppf(TRUSTED, readings.size))).astype(float)
+    # at last none comes back: one on the border would come and go for ever
+    candidate = readings.usable & ((round_ < LATE) | (before > 0))
+    return (candidate & (fit < chi2.ppf(TRUSTED, readings.size))).astype(float)
 
 
 def ratios(sensors: Sequence[Readings], kept: Sequence[Mask], round_: int, scales: Array) -> Array:

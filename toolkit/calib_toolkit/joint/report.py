@@ -31,8 +31,10 @@ def statistics(
     seconds = float(np.sum(np.diff(steps.ends, axis=1)))
     return {
         "readings": {n: len(m) for n, m in zip(c.names, motions, strict=True)},
+        "common_steps": len(steps),
+        "steps_rejected": steps.rejected,
         "seconds": seconds,
-        "rejected": _by_name(c, turned.rejected if placed is None else placed.rejected),
+        "rejected": _by_name(c, np.array([np.mean(~k) for k in turned.kept]) if placed is None else placed.rejected),
         "noise_scale": {n: _noise(turned, placed, i) for i, n in enumerate(c.names)},
         "strength": _strengths(c, steps),
         "driving": _driving(c, seconds),

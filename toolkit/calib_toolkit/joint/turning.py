@@ -11,12 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 from calib_toolkit import se3, sync
 from calib_toolkit.joint import noise, spread
 from calib_toolkit.joint.arrow import Arrow, Solved
 from calib_toolkit.joint.clocks import Clocks
-from calib_toolkit.joint.windows import Index, Windows, hats, reach
+from calib_toolkit.joint.windows import Index, Windows, coning, hats
 from calib_toolkit.types import Motions
 
 Array = NDArray[np.float64]
@@ -26,11 +27,13 @@ SPACING = 0.05
 STENCIL = np.array([1.0, -2.0, 1.0])
 SMOOTHEST = 1e-4
 """Least roughness of the signal, in variances of a reading's rate: a vehicle at rest would leave it none."""
-ROUNDS = 40
+ROUNDS = 30
 CLOSE = 0.01
 """A step of so many sigma is the end; so is a change of scales by twice this share."""
 TURN, LATE, SKEW = 0.5, 1.0, 1e-3
 """How far from its start, in radians, seconds and parts, something may end of which the drive tells nothing."""
+MOST_LATE = 0.05
+"""Seconds that a clock may move at once."""
 SURE = 5.0
 """Sigma from which a clock is said to run at a speed of its own."""
 
@@ -41,7 +44,7 @@ class Turning:
 
     cov: (p, p) of the rotations (``delta``, base axes, 3 for each sensor but the base), then the offsets and then the
     skews of the clocks but the base's. scale: (n,) of each sensor's stated variance. freedom: (n,) degrees of freedom
-    it is told from. rejected: (n,) share of the sensor's readings. rounds: until all stood still.
+    it is told from. kept: (n) of (m,) readings that count. rounds: until all stood still.
     """
 
     R_base_sensor: Array
@@ -49,7 +52,7 @@ class Turning:
     cov: Array
     scale: Array
     freedom: Array
-    rejected: Array
+    kept: tuple[NDArray[np.bool_], ...]
     rounds: int
 
     @property
@@ -84,9 +87,9 @@ def estimate(motions: Sequence[Motions], R: Array, clocks: Clocks, known: Sequen
     _, cov = _step(solved, correction, free | own)
     wider = np.sqrt(spread.inflation(search.pulls(solved), search.stamps(), cov, cov, _groups(len(motions), others)))
     cov = cov * np.outer(wider, wider)
-    rejected = np.array([np.mean(w == 0) for w in search.weights])
+    kept = tuple(w > 0 for w in search.weights)
     freedom = noise.freedoms(search.readings, search.kept)
-    return Turning(search.R, search.clocks, cov, search.scale, freedom, rejected, rounds)
+    return Turning(search.R, search.clocks, cov, search.scale, freedom, kept, rounds)
 
 
 class _Search:
@@ -94,19 +97,20 @@ class _Search:
 
     def __init__(self, motions: Sequence[Motions], R: Array, clocks: Clocks, known: Sequence[Late]) -> None:
         n = len(motions)
-        self.motions, self.R, self.clocks, self.known, self.scale = motions, R.copy(), clocks, known, np.ones(n)
+        self.motions, self.R, self.known, self.scale = motions, R.copy(), known, np.ones(n)
+        self.start = self.clocks = clocks
         self.parameters = 3 * (n - 1) + 2 * (len(clocks) - 1)
         ends = [(clocks.base_time(i, m.start).min(), clocks.base_time(i, m.end).max()) for i, m in enumerate(motions)]
         self.first, last = min(a for a, _ in ends) - 10 * SPACING, max(b for _, b in ends) + 10 * SPACING
         knots = np.arange(self.first, last + SPACING, SPACING)
-        self.reach = max(reach(max(float(np.max(m.end - m.start)) for m in motions), SPACING), len(STENCIL))
-        base = sync.chain(motions[0])
-        self.rates = base.turned.derivative()(np.clip(knots, base.knots[0], base.knots[-1] - 1e-9))
+        self.base = sync.chain(motions[0])
+        within = np.clip(knots, self.base.knots[0], self.base.knots[-1] - 1e-9)
+        self.rates = self.base.turned.derivative()(within)
         noise_of_rate = (
             min(float(np.median(np.trace(m.cov[:, 3:, 3:], axis1=1, axis2=2))) for m in motions) / SPACING**2
         )
         self.smoothest = SMOOTHEST * noise_of_rate
-        self.rough = 0.3 * np.var(np.diff(self.rates, 2, axis=0), axis=0) + self.smoothest
+        self.rough = 0.3 * np.cov(np.diff(self.rates, 2, axis=0).T) + self.smoothest * np.eye(3)
         self.weights = [np.ones(len(m)) for m in motions]
         self.readings: list[noise.Readings] = []
         self.kept: list[NDArray[np.bool_]] = []
@@ -129,8 +133,9 @@ class _Search:
         """Sensor i's readings against the signal, rotation and clock as they stand."""
         m = self.motions[i]
         a, b = self.clocks.base_time(i, m.start), self.clocks.base_time(i, m.end)
-        windows = hats(self.first, SPACING, len(self.rates), a, b, self.reach)
-        turned, later = windows.of(self.rates), windows.of(self.rates, windows.rate)
+        windows = hats(self.first, SPACING, len(self.rates), a, b)
+        turned = windows.of(self.rates) + coning(self.base, a, b)[:, 3:]
+        later = windows.of(self.rates, windows.rate)
         parts, columns = [], np.zeros(0, dtype=np.int64)
         if i:
             parts, columns = [self.R[i].T @ se3.skew(turned)], np.arange(3 * (i - 1), 3 * i)
@@ -152,13 +157,14 @@ class _Search:
     def equations(self, seen: Sequence["_Seen"]) -> Arrow:
         """Of all readings, the signal's smoothness, and what is known beforehand."""
         turns, others = 3 * (len(self.motions) - 1), len(self.clocks) - 1
-        arrow = Arrow(len(self.rates), 3, self.reach, self.parameters)
+        reach = max(len(STENCIL), *(s.windows.weights.shape[1] for s in seen))
+        arrow = Arrow(len(self.rates), 3, reach, self.parameters)
         for R, s in zip(self.R, seen, strict=True):
             weight = s.weight * s.counted[:, None, None]
             by_rate = np.broadcast_to(R.T, weight.shape)
             arrow.add(s.windows, by_rate, weight, s.residual)
             arrow.add_parameters(s.columns, s.by_parameter, s.windows, by_rate, weight, s.residual)
-        arrow.add_prior(STENCIL, self.rates, 1 / self.rough)
+        arrow.add_prior(STENCIL, self.rates, np.asarray(np.linalg.inv(self.rough), dtype=np.float64))
         arrow.hold(0, 1e-9)
         arrow.hold(len(self.rates) - 1, 1e-9)
         arrow.information += np.diag(1 / np.repeat([TURN, LATE, SKEW], [turns, others, others]) ** 2)
@@ -191,11 +197,12 @@ class _Search:
             share = np.einsum("nij,nji->n", se3.rotate_cov(R, s.weight), solved.covariance(s.windows))
             expected = noise.expected(3, share, s.counted)
             self.readings.append(noise.Readings(squared, expected, 3, np.ones(len(squared), dtype=bool)))
-        before, self.weights = self.weights, [noise.weights(r, round_) for r in self.readings]
+        before = self.weights
+        self.weights = [noise.weights(r, round_, w) for r, w in zip(self.readings, before, strict=True)]
         self.kept = [(a > 0) & (b > 0) for a, b in zip(before, self.weights, strict=True)]
         change = noise.ratios(self.readings, self.kept, round_, self.scale)
         self.scale = self.scale * noise.damped(change, round_)
-        self.rough = np.maximum(self.rough * self.rougher(solved), self.smoothest)
+        self.rough = self.rougher(solved)
         return change
 
     def pulls(self, solved: Solved) -> list[Array]:
@@ -214,12 +221,23 @@ class _Search:
         return [self.clocks.base_time(i, m.start) for i, m in enumerate(self.motions)]
 
     def rougher(self, solved: Solved) -> Array:
-        """(3,) by which the signal's second differences are larger than their variance says."""
+        """(3, 3) the covariance that the signal's second differences show, less what of them is not known.
+
+        A full one: whatever axes the base has, its turns about them go together.
+        """
         k = np.arange(len(self.rates) - len(STENCIL) + 1)
         stencils = np.broadcast_to(STENCIL, (len(k), len(STENCIL)))
-        known = len(k) - np.einsum("kii->i", solved.covariance(Windows(k, stencils, stencils))) / self.rough
-        second = (np.diff(self.rates, 2, axis=0) ** 2).sum(axis=0)
-        return np.clip(second / np.maximum(known, 1.0) / self.rough, 0.2, 5.0)
+        second = np.diff(self.rates, 2, axis=0)
+        L = np.linalg.cholesky(self.rough)
+        seen, unknown = (
+            solve_triangular(L, solve_triangular(L, M, lower=True).T, lower=True)
+            for M in (second.T @ second, solved.covariance(Windows(k, stencils, stencils)).sum(axis=0))
+        )
+        known, axes = np.linalg.eigh(len(k) * np.eye(3) - unknown)
+        whiten = axes * np.maximum(known, 1.0) ** -0.5 @ axes.T
+        ratio, axes = np.linalg.eigh(whiten @ seen @ whiten)
+        rough = L @ (axes * np.clip(ratio, 0.2, 5.0)) @ axes.T @ L.T
+        return np.asarray(rough + self.smoothest * np.eye(3))
 
     def move(self, step: Array, solved: Solved) -> None:
         """By a step of the parameters, and the signal with it."""
@@ -227,7 +245,8 @@ class _Search:
         self.rates = self.rates + solved.latents(step)
         self.R[1:] = se3.exp_so3(step[:turns].reshape(-1, 3)) @ self.R[1:]
         late, skew = step[turns : turns + others], step[turns + others :]
-        self.clocks = self.clocks.moved(np.append(0.0, late), np.append(0.0, skew))
+        late = np.clip(late, -MOST_LATE, MOST_LATE)
+        self.clocks = self.clocks.moved(np.append(0.0, late), np.append(0.0, skew)).within(self.start, LATE)
 
     def clock_columns(self, clock: int) -> list[int]:
         """Where a clock's offset and skew are among the parameters."""

@@ -49,15 +49,30 @@ def strengths(steps: Steps, T: Array) -> Array:
     return found
 
 
+def clock(name: str) -> Undetermined:
+    """Of a sensor whose clock nothing told."""
+    return Undetermined(
+        {f"{name}.dt": 1.0},
+        f"the clock offset of {name} was not determined and is taken as zero: neither how the vehicle turned nor how "
+        "fast it went changed so that it would show; drive bends at changing speed",
+    )
+
+
 def turns(directions: Array) -> Array:
     """(6, j) what of untold directions (6, k) are turns and nothing else."""
     return _inside(directions, np.eye(6)[:, 3:])
 
 
-def shifts(directions: Array) -> Array:
-    """(3, 3) projection onto what of untold directions (6, k) are shifts and nothing else."""
-    inside = _inside(directions, np.eye(6)[:, :3])[:3]
-    return np.asarray(inside @ inside.T)
+def nearest(T: Array, directions: Array) -> Array:
+    """Of all poses (4, 4) that are as good along untold directions (6, k), about the one nearest to the base."""
+    T = T.copy()
+    for v in _apart(directions).T:
+        shift, turn = v[:3], v[3:] * UNITS[3:]
+        if shift @ shift > PURE**2:
+            s = -(shift @ T[:3, 3]) / (shift @ shift)
+            T[:3, 3] += s * shift + s**2 / 2 * np.cross(turn, shift)
+            T[:3, :3] = se3.exp_so3(s * turn) @ T[:3, :3]
+    return T
 
 
 def in_words(base: str, name: str, directions: Array) -> list[Undetermined]:
@@ -86,7 +101,7 @@ def _changes(steps: Steps, i: int, T: Array) -> tuple[Array, Array]:
         length = np.linalg.norm(shift[0], axis=1, keepdims=True)
         shift[1] = shift[1] / np.maximum(np.linalg.norm(shift[1], axis=1, keepdims=True), 1e-12) * length
         # each across its own travel: a noise that both share would pass for motion
-        keep = [_across(p) / np.maximum(length, np.median(length))[..., None] for p in shift]
+        keep = [_across(p) / np.maximum(length, max(float(np.median(length)), 1e-9))[..., None] for p in shift]
     both = np.zeros((2, len(steps), 6, 6))
     if steps.has_scale.any():
         sigma = _size((keep[0] @ (shift[0] - shift[1])[..., None])[..., 0])

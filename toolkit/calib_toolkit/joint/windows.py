@@ -6,8 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
+from calib_toolkit.sync import Chain
+
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+PIECES = 8
+"""Of an interval, over which twists are added up."""
 
 
 @dataclass(frozen=True)
@@ -28,13 +33,9 @@ class Windows:
         return np.einsum("nm,nm...->n...", chosen, latents[self.first[:, None] + np.arange(chosen.shape[1])])
 
 
-def reach(longest: float, spacing: float) -> int:
-    """How many hats, ``spacing`` apart, a window of ``longest`` seconds can meet."""
-    return int(np.ceil(longest / spacing)) + 2
-
-
-def hats(start: float, spacing: float, size: int, a: Array, b: Array, reach: int) -> Windows:
+def hats(start: float, spacing: float, size: int, a: Array, b: Array) -> Windows:
     """Integrals from a to b (n,) of a signal, linear between ``size`` knots ``spacing`` apart from ``start`` on."""
+    reach = int(np.ceil(np.max(b - a) / spacing)) + 2
     first = np.clip(np.floor((a - start) / spacing).astype(np.int64), 0, size - reach)
     k = first[:, None] + np.arange(reach)
     at_a, at_b = ((t[:, None] - start) / spacing - k for t in (a, b))
@@ -42,10 +43,11 @@ def hats(start: float, spacing: float, size: int, a: Array, b: Array, reach: int
     return Windows(first, spacing * (_area(at_b) - _area(at_a)), rate)
 
 
-def splines(knots: Array, a: Array, b: Array, reach: int) -> Windows:
+def splines(knots: Array, a: Array, b: Array) -> Windows:
     """Differences from a to b (n,) of a cubic spline with these knots (the ends four times), by its coefficients."""
     size = len(knots) - 4
     (first_a, at_a, slope_a), (first_b, at_b, slope_b) = _basis(knots, a), _basis(knots, b)
+    reach = min(int(np.max(first_b - first_a)) + 4, size)
     first = np.minimum(first_a, size - reach)
     weights, rate = np.zeros((len(a), reach)), np.zeros((len(a), reach))
     n = np.arange(len(a))
@@ -55,6 +57,19 @@ def splines(knots: Array, a: Array, b: Array, reach: int) -> Windows:
         rate[n, first_a - first + j] -= slope_a[:, j]
         rate[n, first_b - first + j] += slope_b[:, j]
     return Windows(first, weights, rate)
+
+
+def coning(base: Chain, a: Array, b: Array) -> Array:
+    """(n, 6) by which the twist from a to b (n,) is more than the sum of the twists in between, ``[v w]``.
+
+    Motions do not commute: ``log T = sum + 1/2 integral [sum so far, twist]`` (Magnus), from the base's own readings.
+    """
+    knots = a[:, None] + (b - a)[:, None] * np.linspace(0.0, 1.0, PIECES + 1)
+    at = base.summed(np.clip(knots, base.knots[0], base.knots[-1]))
+    piece, so_far = np.diff(at, axis=1), at[:, :-1] - at[:, :1]
+    (v_a, w_a), (v_b, w_b) = ((x[..., :3], x[..., 3:]) for x in (so_far, piece))
+    bracket = np.concatenate([np.cross(w_a, v_b) - np.cross(w_b, v_a), np.cross(w_a, w_b)], axis=2)
+    return np.asarray(bracket.sum(axis=1) / 2)
 
 
 def _area(u: Array) -> Array:

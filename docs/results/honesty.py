@@ -1,4 +1,4 @@
-"""Whether the estimator's sigmas hold, on rigs drawn at random: ``python docs/results/statistics.py EXPERIMENT``.
+"""Whether the estimator's sigmas hold, on rigs drawn at random: ``python docs/results/honesty.py EXPERIMENT``.
 
 Every experiment is seeded, prints tables in Markdown, and judges nothing: the columns say what is ideal.
 """

@@ -1,0 +1,89 @@
+"""Which clocks the drive tells, by how the vehicle turned or else by how fast it went."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_toolkit import observability, sync
+from calib_toolkit.joint import start, turning
+from calib_toolkit.joint.clocks import Clocks
+from calib_toolkit.joint.turning import Late, Turning
+from calib_toolkit.types import Motions
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+PERIODS = (1, 4, 16)
+"""Of the slower sensor, over which a speed is told: turns change within a second, a speed hardly does."""
+FEWEST = 30
+"""Readings below which those that were rejected are looked at, too."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """clocks: those that nothing told are taken as they are. cov: (2(q-1), 2(q-1)) of the offsets, then the skews, of
+    the clocks but the base's; zero for what nothing told. open: (q,) which those are.
+    """
+
+    clocks: Clocks
+    cov: Array
+    open: Mask
+
+
+def estimate(motions: Sequence[Motions], turned: Turning, known: Sequence[Late]) -> Told:
+    """What the first stage found, and for clocks that turning does not tell what the speed of travel tells.
+
+    A drive straight on at changing speed tells the clocks of sensors that have scale.
+    """
+    clocks = turned.clocks
+    told = _told(motions, turned, known)
+    dt, skew, cov = clocks.dt * told, clocks.skew * told, _only(turned.clock_cov, told)
+    scaled = [i for i, m in enumerate(motions) if m.has_scale]
+    if 0 in scaled and not told[clocks.of[scaled]].all():
+        travels = [_travel(motions[i]) for i in scaled]
+        went = _by_speed(travels, Clocks(clocks.of[scaled], dt, skew, clocks.t_ref), told)
+        more = ~told & _told(travels, went, known)
+        more[np.setdiff1d(np.arange(len(clocks)), clocks.of[scaled])] = False
+        dt, skew, told = dt + went.clocks.dt * more, skew + went.clocks.skew * more, told | more
+        cov = cov + _only(went.clock_cov, more)
+    return Told(replace(clocks, dt=dt, skew=skew), cov, ~told)
+
+
+def _by_speed(travels: Sequence[Motions], clocks: Clocks, told: Mask) -> Turning:
+    """The first stage with travels in the place of turns: straight on, they too differ by a rotation alone."""
+    chains = [sync.chain(m) for m in travels]
+    late = Clocks.starting(list(clocks.of), start.lags(chains), clocks.t_ref)
+    dt = clocks.dt.copy()
+    for c, there in zip(dict.fromkeys(clocks.of), late.dt, strict=True):
+        dt[c] = dt[c] if told[c] else there
+    first = replace(clocks, dt=dt)
+    on_base = [c.shifted(d) for c, d in zip(chains, dt[clocks.of], strict=True)]
+    R = start.poses(sync.synchronise(on_base, np.inf))[:, :3, :3]
+    return turning.estimate(travels, R, first, [Late(int(c), dt[c], 1e-6) for c in np.flatnonzero(told)[1:]])
+
+
+def _travel(m: Motions) -> Motions:
+    vec, cov = np.zeros_like(m.vec), np.tile(np.eye(6), (len(m), 1, 1))
+    vec[:, 3:], cov[:, 3:, 3:] = m.vec[:, :3], m.cov[:, :3, :3]
+    return replace(m, vec=vec, cov=cov)
+
+
+def _told(motions: Sequence[Motions], turned: Turning, known: Sequence[Late]) -> Mask:
+    """(q,) whether the angular speed of a sensor on each clock changes with the base's, or a number tells it."""
+    chains = []
+    for i, (m, kept) in enumerate(zip(motions, turned.kept, strict=True)):
+        good = m[kept] if kept.sum() >= FEWEST else m
+        chains.append(sync.chain(good).shifted(float(turned.clocks.dt[turned.clocks.of[i]])))
+    told = np.zeros(len(turned.clocks), dtype=bool)
+    told[[0, *(k.clock for k in known)]] = True
+    for chain, c in zip(chains[1:], turned.clocks.of[1:], strict=True):
+        told[c] |= any(not observability.unmeasured_times("ab", [chains[0], chain], "ab", k) for k in PERIODS)
+    return told
+
+
+def _only(cov: Array, clocks: Mask) -> Array:
+    """A covariance of offsets and skews with zero for all but some clocks (q,)."""
+    kept = np.tile(clocks[1:], 2).astype(float)
+    return cov * np.outer(kept, kept)
