@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_toolkit import se3, sync
-from calib_toolkit.joint import noise
+from calib_toolkit.joint import noise, turning
 from calib_toolkit.joint.arrow import Arrow, Solved
 from calib_toolkit.joint.clocks import Clocks
 from calib_toolkit.joint.model import Linear, linear, read
+from calib_toolkit.joint.readings import travel
 from calib_toolkit.joint.windows import Index, Windows, coning, splines
 from calib_toolkit.types import Motions
 
@@ -53,8 +54,9 @@ class Moving:
     Parameters are ``(dt, delta)`` of each sensor but the base, then the bias of each, base axes: 9(n-1) in all.
     information: of these; feigned: the part of it that is made of noise. by_clock: (9(n-1), 2(q-1)), shared with the
     offsets and skews of the clocks. free: (9(n-1), k) orthonormal directions that were searched. scale: (n,) of each
-    sensor's stated variance of shifts. freedom: (n,) degrees of freedom it is told from. rejected: (n,) share of
-    readings. pulls: by sensor, each reading's part (m, 9(n-1)) of the gradient.
+    sensor's stated variance of shifts. freedom: (n,) degrees of freedom it is told from. together: sensors for which
+    only the sum of theirs is told. rejected: (n,) share of readings. pulls: by sensor, each reading's (m, 9(n-1)) part
+    of the gradient.
     """
 
     T_base_sensor: Array
@@ -66,6 +68,7 @@ class Moving:
     free: Array
     scale: Array
     freedom: Array
+    together: tuple[int, ...]
     rejected: Array
     pulls: tuple[Array, ...]
 
@@ -90,6 +93,7 @@ def estimate(
         free,
         search.scale,
         noise.freedoms(search.shifts, search.kept),
+        tuple(search.together),
         np.array([np.mean(w == 0) for w in search.weights]),
         tuple(_pulls(s, solved, poses) for s in seen),
     )
@@ -117,7 +121,14 @@ class _Search:
     ) -> None:
         n = len(motions)
         self.motions, self.T, self.clocks, self.turn_scale = motions, T.copy(), clocks, turn_scale
-        self.free, self.prior, self.scale, self.bias = free, prior, np.ones(n), np.zeros((n, 3))
+        self.free, self.prior, self.bias = free, prior, np.zeros((n, 3))
+        # of two sensors' distances only the sum of the noise shows; how it divides, each one's own jitter tells
+        self.together = [i for i, m in enumerate(motions) if m.has_scale]
+        if len(self.together) > 2:
+            self.together = []
+        self.scale = np.array(
+            [turning.alone(travel(m)) if i in self.together else 1.0 for i, m in enumerate(motions)]
+        )
         spans = [(clocks.base_time(i, m.start), clocks.base_time(i, m.end)) for i, m in enumerate(motions)]
         base = sync.chain(motions[0])
         breaks = _breaks(base, min(a.min() for a, _ in spans), max(b.max() for _, b in spans))
@@ -184,7 +195,7 @@ class _Search:
         before = self.weights
         self.weights = [noise.weights(r, round_, w) for r, w in zip(whole, before, strict=True)]
         self.kept = [(a > 0) & (b > 0) & s.usable for a, b, s in zip(before, self.weights, self.shifts, strict=True)]
-        change = noise.ratios(self.shifts, self.kept, round_, self.scale)
+        change = noise.ratios(self.shifts, self.kept, round_, self.scale, self.together)
         self.scale = self.scale * noise.damped(change, round_)
         return change
 

@@ -65,20 +65,25 @@ def weights(readings: Readings, round_: int, before: Array) -> Array:
     return (candidate & (fit < chi2.ppf(TRUSTED, readings.size))).astype(float)
 
 
-def ratios(sensors: Sequence[Readings], kept: Sequence[Mask], round_: int, scales: Array) -> Array:
+def ratios(
+    sensors: Sequence[Readings], kept: Sequence[Mask], round_: int, scales: Array, together: Sequence[int] = ()
+) -> Array:
     """(n,) by which each sensor's scale (n,) should be multiplied. kept: (n) of (m,) to tell it from.
 
-    Of two sensors only the sum of their noise can be told: both get the same.
+    together: sensors of which only the sum of their noise shows: all get the same.
     """
     if round_ < SETTLING:
-        common = np.array([_median(r) for r in sensors])
-        # the ratio of two sensors' noise is left for later, when wrong readings are out of the way
-        return np.full(len(sensors), np.median(common)) if len(sensors) == 2 else common
+        found = np.array([_median(r) for r in sensors])
+        if together:
+            found[list(together)] = np.median(found[list(together)])
+        return found
     total = np.array([r.squared[k].sum() for r, k in zip(sensors, kept, strict=True)])
     freedom = np.maximum(freedoms(sensors, kept), 0.0)
-    if len(sensors) == 2:
-        return np.full(2, (total.sum() + STATED / scales.mean()) / (freedom.sum() + STATED))
-    return (total + STATED / scales) / (freedom + STATED)
+    stated = STATED / scales
+    if together:
+        for values in (total, freedom, stated):
+            values[list(together)] = values[list(together)].mean()
+    return (total + stated) / (freedom + STATED)
 
 
 def freedoms(sensors: Sequence[Readings], kept: Sequence[Mask]) -> Array:

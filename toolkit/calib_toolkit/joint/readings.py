@@ -1,5 +1,7 @@
 """Motions made ready: in order of time, and no more often than the motion of a vehicle needs."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,6 +37,13 @@ def joined(m: Motions, together: int) -> Motions:
         more = np.flatnonzero(begins + k < ends)
         vec[more], cov[more] = _then(vec[more], cov[more], m.vec[begins[more] + k], m.cov[begins[more] + k])
     return Motions(m.start[begins], m.end[ends - 1], vec, cov, m.has_scale)
+
+
+def travel(m: Motions) -> Motions:
+    """Motions that hold what a sensor travelled in the place of its turns, and do not travel."""
+    vec, cov = np.zeros_like(m.vec), np.tile(np.eye(6), (len(m), 1, 1))
+    vec[:, 3:], cov[:, 3:, 3:] = m.vec[:, :3], m.cov[:, :3, :3]
+    return replace(m, vec=vec, cov=cov)
 
 
 def _then(vec_a: Array, cov_a: Array, vec_b: Array, cov_b: Array) -> tuple[Array, Array]:

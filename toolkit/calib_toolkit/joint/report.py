@@ -49,10 +49,10 @@ def _by_name(c: Calibration, values: Array) -> dict[str, float]:
 
 def _noise(turned: Turning, placed: Moving | None, i: int) -> dict[str, Any]:
     """By what a sensor's stated variances were multiplied, and whether that was told for it alone or for the pair."""
-    alone = len(turned.scale) > 2 and turned.freedom[i] > noise.VISIBLE
+    alone = turned.freedom[i] > noise.VISIBLE
     found: dict[str, Any] = {"turns": float(turned.scale[i]), "kind": "own" if alone else "pair"}
     if placed is not None:
-        alone = len(turned.scale) > 2 and placed.freedom[i] > noise.VISIBLE
+        alone = i not in placed.together and placed.freedom[i] > noise.VISIBLE
         found |= {"shifts": float(placed.scale[i]), "kind_of_shifts": "own" if alone else "pair"}
     return found
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from calib_toolkit import observability, sync
 from calib_toolkit.joint import start, turning
 from calib_toolkit.joint.clocks import Clocks
+from calib_toolkit.joint.readings import travel
 from calib_toolkit.joint.turning import Late, Turning
 from calib_toolkit.types import Motions
 
@@ -42,7 +43,7 @@ def estimate(motions: Sequence[Motions], turned: Turning, known: Sequence[Late])
     dt, skew, cov = clocks.dt * told, clocks.skew * told, _only(turned.clock_cov, told)
     scaled = [i for i, m in enumerate(motions) if m.has_scale]
     if 0 in scaled and not told[clocks.of[scaled]].all():
-        travels = [_travel(motions[i]) for i in scaled]
+        travels = [travel(motions[i]) for i in scaled]
         went = _by_speed(travels, Clocks(clocks.of[scaled], dt, skew, clocks.t_ref), told)
         more = ~told & _told(travels, went, known)
         more[np.setdiff1d(np.arange(len(clocks)), clocks.of[scaled])] = False
@@ -62,12 +63,6 @@ def _by_speed(travels: Sequence[Motions], clocks: Clocks, told: Mask) -> Turning
     on_base = [c.shifted(d) for c, d in zip(chains, dt[clocks.of], strict=True)]
     R = start.poses(sync.synchronise(on_base, np.inf))[:, :3, :3]
     return turning.estimate(travels, R, first, [Late(int(c), dt[c], 1e-6) for c in np.flatnonzero(told)[1:]])
-
-
-def _travel(m: Motions) -> Motions:
-    vec, cov = np.zeros_like(m.vec), np.tile(np.eye(6), (len(m), 1, 1))
-    vec[:, 3:], cov[:, 3:, 3:] = m.vec[:, :3], m.cov[:, :3, :3]
-    return replace(m, vec=vec, cov=cov)
 
 
 def _told(motions: Sequence[Motions], turned: Turning, known: Sequence[Late]) -> Mask:

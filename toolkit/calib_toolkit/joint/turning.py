@@ -92,6 +92,13 @@ def estimate(motions: Sequence[Motions], R: Array, clocks: Clocks, known: Sequen
     return Turning(search.R, search.clocks, cov, search.scale, freedom, kept, rounds)
 
 
+def alone(m: Motions) -> float:
+    """How many times its stated variance a sensor's turns jitter, beside a signal that only they tell."""
+    search = _Search([m], np.eye(3)[None], Clocks.starting([0], np.zeros(1), 0.0), ())
+    search.maximise(np.zeros(0, dtype=bool))
+    return float(search.scale[0])
+
+
 class _Search:
     """Rounds of Gauss-Newton. R, clocks, rates (K, 3) of turn, roughness (3,), scale and weights as they stand."""
 
