@@ -19,13 +19,17 @@ def read(tmp_path):
     return read
 
 
-def test_the_defaults_are_the_papers():
+def test_the_defaults_of_the_papers_method_are_the_papers():
     c = Config()
     assert c.timing.steps == 10_000  # VI-A1
     assert (c.timing.trim, c.rotation.trim, c.translation.trim) == (0.25, 0.25, 0.25)  # VI-C1
     assert c.sync.gate == 10.0  # VI-A1
-    assert c.method == "paper"
     assert c.jobs >= 1
+
+
+def test_the_method_is_joint_unless_chosen(read):
+    assert Config().method == "joint"
+    assert read('method = "paper"').method == "paper"
 
 
 def test_an_empty_file_changes_nothing(read):

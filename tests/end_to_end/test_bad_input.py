@@ -286,13 +286,35 @@ def test_something_in_the_place_of_the_result(refused, drive, tmp_path):
 # ---- what the drive does not tell
 
 
-@pytest.mark.parametrize("kind", ["static", "straight"])
-@pytest.mark.parametrize("body", [VELO + INS, VELO + INS + CAM, CAM + CAM1], ids=["scaled", "camera", "cameras"])
-def test_no_turning_at_all(refused, drive, kind, body):
-    sentence = refused(drive(body, HEAD + f"drive = '{kind}'\n"))
+BODIES = pytest.mark.parametrize(
+    "body", [VELO + INS, VELO + INS + CAM, CAM + CAM1], ids=["scaled", "camera", "cameras"]
+)
+
+
+@BODIES
+@pytest.mark.parametrize(("kind", "method"), [("static", "joint"), ("static", "paper"), ("straight", "paper")])
+def test_no_turning_at_all(refused, drive, kind, method, body):
+    sentence = refused(drive(body, HEAD + f"drive = '{kind}'\n"), "--method", method)
     assert "turn" in sentence
     assert "overlap" not in sentence
     assert "drive" in sentence.partition("turn")[2]  # what to do about it
+
+
+def test_cameras_on_a_straight_drive_are_refused(refused, drive):
+    sentence = refused(drive(CAM + CAM1, HEAD + "drive = 'straight'\n"))
+    assert "drive bends to both sides" in sentence
+
+
+@pytest.mark.parametrize("body", [VELO + INS, VELO + INS + CAM], ids=["scaled", "camera"])
+def test_a_straight_drive_leaves_open_what_it_can_not_tell(run, drive, written, body):
+    result = run(drive(body, HEAD + "drive = 'straight'\n"))
+    assert result.exit_code == 3, result.output
+    found = written()
+    for name in list(found["sensors"])[1:]:
+        assert [found["sensors"][name]["sigma"][k] for k in ("x", "y", "z", "rx")] == [None] * 4
+        assert all(found["sensors"][name]["sigma"][k] > 0 for k in ("ry", "rz"))
+    said = " ".join(u["sentence"] for u in found["undetermined"])
+    assert "the vehicle only drove straight ahead; drive bends to both sides" in said
 
 
 def test_a_plane_tells_no_height(run, drive, written):
@@ -329,8 +351,16 @@ def test_no_overlap_in_time(refused, drive):
     assert "epoch" in sentence
 
 
-def test_clocks_further_apart_than_the_search_are_not_believed(run, rig, written):
+def test_clocks_that_are_far_apart_are_found(run, rig, written):
     result = run(rig(lambda t, p, q: (t + 15.0, p, q)))
+    assert result.exit_code == 0, result.output
+    b = written()["sensors"]["b"]
+    assert b["dt_base_sensor"] == pytest.approx(-15.0, abs=2e-3)
+    assert [row[3] for row in b["T_base_sensor"][:3]] == pytest.approx([0.5] * 3, abs=4 * b["sigma"]["z"])
+
+
+def test_clocks_further_apart_than_the_papers_search_are_not_believed(run, rig, written):
+    result = run(rig(lambda t, p, q: (t + 15.0, p, q)), "--method", "paper")
     if result.exit_code == 1:
         return
     assert result.exit_code == 3, result.output

@@ -36,9 +36,13 @@ def errors(found):
     return (found.T_base_sensor[:, :3, 3] - true[:, :3, 3])[1:], turned[1:], found.dt_base_sensor[1:]
 
 
-def test_common_stamps_without_offset_give_the_truth_to_a_millionth():
+METHODS = pytest.mark.parametrize("method", ["paper", "joint"])
+
+
+@METHODS
+def test_common_stamps_without_offset_give_the_truth_to_a_millionth(method):
     true = path(SECONDS, 1)
-    result = calibrate_motions({n: motions(true, T, 1e-7, 10.0) for n, T in RIG.items()})
+    result = calibrate_motions({n: motions(true, T, 1e-7, 10.0) for n, T in RIG.items()}, Config(method=method))
     shifts, turns, dt = errors(result.calibration)
     assert np.abs(shifts).max() < 1e-6
     assert np.abs(np.radians(turns)).max() < 1e-6
@@ -50,24 +54,26 @@ CLOCKS = {"velo": (0.0, 0.0), "ins": (0.0031, -0.06), "cam": (0.0037, 0.025), "f
 
 
 @pytest.mark.long
+@METHODS
 @pytest.mark.parametrize("drive", ["street", "court"])
-def test_other_stamps_and_clocks_give_it_to_a_millimetre(drive):
+def test_other_stamps_and_clocks_give_it_to_a_millimetre(drive, method):
     """At 100 Hz nothing of the motion lies between readings: 0.6 mm, 0.0005 degrees and 0.004 ms are seen."""
     true, rates = path(SECONDS, 1, drive), {"front": 130.0}
     given = {n: motions(true, T, 1e-4, rates.get(n, 100.0), CLOCKS[n][0], CLOCKS[n][1]) for n, T in RIG.items()}
-    shifts, turns, dt = errors(calibrate_motions(given, Config()).calibration)
+    shifts, turns, dt = errors(calibrate_motions(given, Config(method=method)).calibration)
     assert np.abs(shifts).max() < 1e-3
     assert np.abs(turns).max() < 0.01
     assert np.abs(dt - [CLOCKS[n][1] for n in list(RIG)[1:]]).max() < 1e-4
 
 
 @pytest.mark.long
+@METHODS
 @pytest.mark.parametrize("drive", ["street", "rough", "court"])
-def test_at_ten_hertz_the_suspension_between_readings_is_the_limit(drive):
+def test_at_ten_hertz_the_suspension_between_readings_is_the_limit(drive, method):
     """Two to ten hertz of roll and pitch fall between readings: up to 16 mm, 0.23 degrees and 0.2 ms are seen."""
     true = path(SECONDS, 1, drive)
     given = {n: motions(true, T, 1e-3, 10.0, 10 * CLOCKS[n][0], CLOCKS[n][1]) for n, T in RIG.items()}
-    shifts, turns, dt = errors(calibrate_motions(given, Config()).calibration)
+    shifts, turns, dt = errors(calibrate_motions(given, Config(method=method)).calibration)
     assert np.abs(shifts).max() < 0.03
     assert np.abs(turns).max() < 0.3
     assert np.abs(dt - [CLOCKS[n][1] for n in list(RIG)[1:]]).max() < 3e-4

@@ -28,12 +28,13 @@ COMMON = 0.3
 
 
 def unmeasured_times(
-    names: Sequence[str], chains: Sequence[Chain], clocks: Sequence[Hashable], periods: int = 1
+    names: Sequence[str], chains: Sequence[Chain], clocks: Sequence[Hashable], periods: int = 1, chance: float = 0.0
 ) -> list[Undetermined]:
     """Sensors on clocks of which none's angular speed changes together with the first sensor's.
 
     chains: (n,) on one clock. clocks: (n,) sensors with equal ones share an offset. periods: of the slowest sensor,
-    over which a speed is told.
+    over which a speed is told. chance: of few windows even a high correlation is chance; how many standard deviations
+    of that it must have.
     """
     lo, hi = common_span(chains)
     window = periods * max(c.period for c in chains)
@@ -43,9 +44,10 @@ def unmeasured_times(
     slope = slope[:, known, None]
     if not known.any():
         slope = np.zeros((len(names), 1, 1))
+    common = chance / np.sqrt(slope.shape[1])
     measured = {
         clocks[0],
-        *(c for c, other in zip(clocks, slope, strict=True) if stand_out(slope[0], other, 12.0, 0.0)),
+        *(c for c, other in zip(clocks, slope, strict=True) if stand_out(slope[0], other, 12.0, common)),
     }
     return [
         Undetermined(

@@ -24,7 +24,7 @@ def skew(v: Array) -> Array:
 
 def exp_so3(rotvec: ArrayLike) -> Array:
     """Rotation matrices of angle-axis vectors. (..., 3) radians -> (..., 3, 3)."""
-    r = np.asarray(rotvec, dtype=float)
+    r = np.array(rotvec, dtype=float)  # SciPy writes to what it is given
     return Rotation.from_rotvec(r.reshape(-1, 3)).as_matrix().reshape(*r.shape, 3)
 
 

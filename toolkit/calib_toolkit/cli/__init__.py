@@ -4,6 +4,7 @@ Exit statuses: 0 done; 1 refused, with one sentence; 2 wrong usage; 3 done, but 
 is wrong or not determined; 130 interrupted.
 """
 
+import os
 from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any
@@ -89,3 +90,5 @@ def _exit(ctx: click.Context, status: int, sentence: str) -> None:
 @click.option("--debug", is_flag=True, help="Show the whole traceback of an error.")
 def main(debug: bool) -> None:
     """Extrinsics, clock offsets and their uncertainty of a vehicle's sensors, from an ordinary drive."""
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")  # matrices are small, and processes are the parallelism

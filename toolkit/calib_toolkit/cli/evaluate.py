@@ -77,8 +77,6 @@ def evaluate(
     when every repeat has its rows, refused ones included; 3 when some failed in a way that nobody foresaw; 1 when
     nothing can be compared, with the reason; 2 for wrong usage.
     """
-    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")  # the processes are the parallelism
     from calib_toolkit.cli.bars import bars
     from calib_toolkit.config import Config
     from calib_toolkit.evaluation import experiment, figures, panorama, store, summary

@@ -1,6 +1,8 @@
 """A calibration as a table for people."""
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +13,7 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from calib_toolkit import delta, se3
+from calib_toolkit.joint.report import WANTED
 from calib_toolkit.types import Calibration, Result
 
 Array = NDArray[np.float64]
@@ -18,6 +21,12 @@ COLUMNS = ("x\nm", "y\nm", "z\nm", "roll\ndeg", "pitch\ndeg", "yaw\ndeg", "dt\nm
 NOISY = 1.5
 """Disagreement of two sensors, in multiples of their stated noise, from which the reader is told."""
 DIGITS = (3, 3, 3, 2, 2, 2, 2)
+MISSTATED = 2.0
+"""Sigma of a sensor's readings over what was stated, or the other way round, from which the reader is told."""
+MANY = 0.05
+"""Share of a sensor's readings that were rejected from which the reader is told."""
+TURNED_DEG = 0.2
+"""Degrees between a sensor's travel and its turns from which the reader is told."""
 
 
 def show_result(result: Result, console: Console, reference: Calibration | None = None, middle: float = 0.0) -> None:
@@ -50,8 +59,63 @@ def show_result(result: Result, console: Console, reference: Calibration | None 
             markup=False,
             soft_wrap=True,
         )
+    for note in notes(result):
+        console.print(f"note: {note}", markup=False, soft_wrap=True)
     for warning in result.warnings:
         console.print(f"warning: {warning}", markup=False, soft_wrap=True)
+
+
+def notes(result: Result) -> list[str]:
+    """What the joint estimator found beside the calibration and a reader should know, a sentence each."""
+    found = result.statistics
+    rejected = [f"{share:.0%} of {n}" for n, share in found.get("rejected", {}).items() if share > MANY]
+    sentences = list(_misstated(found.get("noise_scale", {})))
+    if rejected:
+        sentences.append(f"readings rejected because they do not fit: {', '.join(rejected)}")
+    if held := found.get("prior"):
+        sentences.append(f"held by measured values: {', '.join(held)}")
+    turned = [f"{n} by {d:.1f} deg" for n, d in (found.get("bias_deg") or {}).items() if d > TURNED_DEG]
+    if turned:
+        sentences.append(
+            f"travel is turned against turns: {', '.join(turned)}; a fault of that sensor's own motion, or of "
+            f"{result.calibration.base}'s if all have it; the rotation is taken from turns alone"
+        )
+    return [*sentences, *_longer(found.get("driving", {}), found.get("seconds", 0.0))]
+
+
+def _misstated(scales: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    """Whose readings are noisier, or less noisy, than was stated; sensors that are told alike in one sentence."""
+    groups = defaultdict(list)
+    for name, scale in scales.items():
+        for part, kind in (("turns", "kind"), ("shifts", "kind_of_shifts")):
+            times = float(np.sqrt(scale.get(part, 1.0)))
+            if not 1 / MISSTATED <= times <= MISSTATED:
+                more, alone = times > 1, scale[kind] == "own"
+                groups[part, more, alone].append(f"{name} {times if more else 1 / times:.1f} times")
+    for (part, more, alone), sensors in groups.items():
+        whose = "told for each alone" if alone else "told for the pair, not for each"
+        yield f"{part} are {'noisier' if more else 'less noisy'} than stated: {', '.join(sensors)} ({whose})"
+
+
+def _longer(driving: Mapping[str, Mapping[str, float]], seconds: float) -> Iterator[str]:
+    """How long to drive until all that is told is known as well as is wanted, if that is longer than was driven."""
+    parts = []
+    for axes, what, sensor in (
+        (("x", "y", "z"), f"position above to {100 * WANTED['x']:.0f} cm", "{} {}"),
+        (("rx", "ry", "rz"), f"angle above to {np.degrees(WANTED['rx']):.2f} deg", "{} about {}"),
+    ):
+        needs = {sensor.format(n, a[-1]): s for n, each in driving.items() for a, s in each.items() if a in axes}
+        worst = max(needs, key=lambda key: needs[key], default="")
+        if worst and needs[worst] > seconds:
+            parts.append(f"{_duration(needs[worst])} to know every {what} ({worst} needs most)")
+    if parts:
+        yield f"drive like this, in all, {', and '.join(parts)}"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"
 
 
 def readable(c: Calibration, name: str) -> tuple[Array, Array]:

@@ -10,6 +10,7 @@ from scipy.linalg import block_diag, null_space
 
 from calib_toolkit import assembly, checks, observability, se3, sync
 from calib_toolkit.config import Config
+from calib_toolkit.errors import NotObservableError
 from calib_toolkit.joint import moving, prior, report, spread, start, told, turning, verdict
 from calib_toolkit.joint.clocks import Clocks
 from calib_toolkit.joint.readings import ready
@@ -63,6 +64,16 @@ class Placed:
 
 def calibrate(motions: Mapping[str, Motions], config: Config, clocks: Sequence[str], progress: Progress) -> Result:
     """All sensors at once. clocks: (n,) sensors that name the same clock share it. Raises CalibrationError."""
+    try:
+        return _calibrate(motions, config, clocks, progress)
+    except np.linalg.LinAlgError as e:
+        raise NotObservableError(
+            f"the motions of {', '.join(motions)} can not be brought together ({e}); leave out one sensor after the "
+            "other to find the one whose motion is wrong"
+        ) from e
+
+
+def _calibrate(motions: Mapping[str, Motions], config: Config, clocks: Sequence[str], progress: Progress) -> Result:
     progress.begin(STAGES, 2)
     timed = _time(motions, clocks, config.prior)
     progress.advance(STAGES, 1)
@@ -94,6 +105,7 @@ def _time(motions: Mapping[str, Motions], clocks: Sequence[str], known: Sequence
     late = prior.late(known, names, first)
     turned = turning.estimate(in_order, start.poses(steps)[:, :3, :3], first, late)
     clocks_told = told.estimate(in_order, turned, late)
+    start.agree(names, [c.shifted(d) for c, d in zip(chains, clocks_told.clocks.dt[turned.clocks.of], strict=True)])
     steps = _steps(names, chains, clocks_told.clocks)
     return Timed(names, in_order, turned, clocks_told, steps, start.poses(steps))
 
@@ -107,8 +119,7 @@ def _turn(timed: Timed) -> Placed:
     cov[np.ix_(at, at)] = timed.turned.cov[: 3 * (n - 1), : 3 * (n - 1)]
     cov[6 * (n - 1) :, 6 * (n - 1) :] = timed.told.cov
     T = se3.rigid(timed.turned.R_base_sensor, np.zeros((n, 3)))
-    unscaled = replace(timed.steps, has_scale=np.zeros(n, dtype=bool))
-    open_ = [verdict.turns(directions) for directions in verdict.untold(unscaled, T)]
+    open_ = [verdict.turns(directions) for directions in verdict.untold(_unscaled(timed.steps), T)]
     if not timed.steps.has_scale.any() and all(directions.shape[1] == 3 for directions in open_):
         checks.still()
     return Placed(T, cov, _unknown(timed, open_, cov), None)
@@ -137,6 +148,7 @@ def _place(timed: Timed, known: Sequence[Measured]) -> Placed:
     if any(axes.size for axes in biased):
         found = search(T=found.T_base_sensor, free=_free(open_, biased))
     cov, gain = spread.covariance(found.information, found.feigned, found.free)
+    cov = cov + _as_biased(timed, found, biased)
     stamps = [timed.clocks.base_time(i, m.start) for i, m in enumerate(timed.motions)]
     groups = np.split(np.arange(6 * (len(names) - 1)), len(names) - 1)
     wider = np.sqrt(spread.inflation(found.pulls, stamps, gain, cov, groups))
@@ -204,15 +216,35 @@ def _biased(timed: Timed, open_: Sequence[Array], found: moving.Moving) -> list[
     A travel that is turned against the turns is a fault of the sensor's own motion, and tells nothing of rotation.
     """
     axes = []
-    for k, directions in enumerate(open_):
+    by_turns = verdict.untold(_unscaled(timed.steps), timed.T)
+    for k, (directions, unturned) in enumerate(zip(open_, by_turns, strict=True)):
         R = found.T_base_sensor[k + 1, :3, :3], timed.turned.R_base_sensor[k + 1]
         apart = se3.log_so3(R[1] @ R[0].T)
-        # what nothing told may lie anywhere
-        told = null_space(verdict.turns(directions)[3:].T) if directions.size else np.eye(3)
+        # what nothing told, or turns do not, may lie anywhere
+        anywhere = np.concatenate([verdict.turns(directions), verdict.turns(unturned)], axis=1)[3:]
+        told = null_space(anywhere.T) if anywhere.size else np.eye(3)
+        if not told.size:
+            axes.append(told)
+            continue
         variance, vectors = np.linalg.eigh(told.T @ timed.turned.cov[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] @ told)
         each = told @ vectors
         axes.append(each[:, (each.T @ apart) ** 2 > SURE**2 * variance])
     return axes
+
+
+def _as_biased(timed: Timed, found: moving.Moving, biased: Sequence[Array]) -> Array:
+    """(9(n-1), 9(n-1)) what a travel that is turned about one axis leaves open about the others that it tells.
+
+    It may well be turned as far about those, where the turns do not tell enough to show it.
+    """
+    cov = np.zeros((len(found.free), len(found.free)))
+    ahead = np.sum(timed.steps.vec[0, :, :3], axis=0)
+    for k, axes in enumerate(biased):
+        if axes.size:
+            others = null_space(np.column_stack([axes, ahead]).T)
+            at = slice(6 * k + 3, 6 * k + 6)
+            cov[at, at] = np.sum(found.bias[k + 1] ** 2) * others @ others.T
+    return cov
 
 
 def _free(open_: Sequence[Array], biased: Sequence[Array]) -> Array:
@@ -221,6 +253,11 @@ def _free(open_: Sequence[Array], biased: Sequence[Array]) -> Array:
     """
     poses = [null_space((v / verdict.UNITS[:, None]).T) for v in open_]
     return block_diag(*poses, *biased)
+
+
+def _unscaled(steps: sync.Steps) -> sync.Steps:
+    """Of which only the turns count."""
+    return replace(steps, has_scale=np.zeros(len(steps.has_scale), dtype=bool))
 
 
 def _steps(names: Sequence[str], chains: Sequence[sync.Chain], clocks: Clocks) -> sync.Steps:

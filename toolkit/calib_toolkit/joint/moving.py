@@ -55,8 +55,8 @@ class Moving:
     information: of these; feigned: the part of it that is made of noise. by_clock: (9(n-1), 2(q-1)), shared with the
     offsets and skews of the clocks. free: (9(n-1), k) orthonormal directions that were searched. scale: (n,) of each
     sensor's stated variance of shifts. freedom: (n,) degrees of freedom it is told from. together: sensors for which
-    only the sum of theirs is told. rejected: (n,) share of readings. pulls: by sensor, each reading's (m, 9(n-1)) part
-    of the gradient.
+    only the sum of theirs is told. rejected: (n,) share of readings. pulls: by sensor, each reading's part of the
+    gradient (m, 9(n-1)).
     """
 
     T_base_sensor: Array
@@ -120,7 +120,8 @@ class _Search:
         self, motions: Sequence[Motions], T: Array, clocks: Clocks, turn_scale: Array, free: Array, prior: Prior
     ) -> None:
         n = len(motions)
-        self.motions, self.T, self.clocks, self.turn_scale = motions, T.copy(), clocks, turn_scale
+        self.motions, self.T, self.clocks = motions, T.copy(), clocks
+        self.turn_scale = self.least_turn_scale = turn_scale
         self.free, self.prior, self.bias = free, prior, np.zeros((n, 3))
         # of two sensors' distances only the sum of the noise shows; how it divides, each one's own jitter tells
         self.together = [i for i, m in enumerate(motions) if m.has_scale]
@@ -181,7 +182,7 @@ class _Search:
 
     def judge(self, round_: int, solved: Solved, seen: Sequence[_Seen], step: Array) -> Array:
         """Bring weights and scales up to date; (n,) by what the scales were wrong."""
-        moved, whole = solved.latents(step), []
+        moved, whole, turns = solved.latents(step), [], []
         self.shifts = []
         for s, counted, far in zip(seen, self.weights, self.far, strict=True):
             r = s.reading
@@ -189,14 +190,19 @@ class _Search:
                 r.residual - (r.by_twist @ s.windows.of(moved)[:, :, None])[..., 0] - s.by_parameter @ step[s.columns]
             )
             fitted = r.by_twist @ solved.covariance(s.windows) @ np.swapaxes(r.by_twist, 1, 2)
-            whole.append(_readings(r, left, fitted, counted, left.shape[1]))
-            shifts = _readings(r, left, fitted, counted, left.shape[1] - 3)
+            d = left.shape[1]
+            whole.append(_readings(r, left, fitted, counted, slice(d)))
+            turns.append(_readings(r, left, fitted, counted, slice(d - 3, d)))
+            shifts = _readings(r, left, fitted, counted, slice(d - 3))
             self.shifts.append(replace(shifts, usable=shifts.usable & far))
         before = self.weights
         self.weights = [noise.weights(r, round_, w) for r, w in zip(whole, before, strict=True)]
         self.kept = [(a > 0) & (b > 0) & s.usable for a, b, s in zip(before, self.weights, self.shifts, strict=True)]
         change = noise.ratios(self.shifts, self.kept, round_, self.scale, self.together)
         self.scale = self.scale * noise.damped(change, round_)
+        # what one cubic a reading leaves of the turns is noise here, which the first stage had no need of
+        turned = noise.ratios(turns, self.kept, round_, self.turn_scale)
+        self.turn_scale = np.maximum(self.turn_scale * noise.damped(turned, round_), self.least_turn_scale)
         return change
 
     def move(self, step: Array, solved: Solved) -> None:
@@ -276,11 +282,12 @@ def _travel(base: sync.Chain, start: Array, end: Array) -> Array:
     return np.asarray(np.linalg.norm(shift[:, :3], axis=1) / AROUND * (end - start))
 
 
-def _readings(reading: Linear, left: Array, fitted: Array, counted: Array, size: int) -> noise.Readings:
-    """Of the first ``size`` numbers of what is left (m, d). fitted: (m, d, d) covariance of what is explained."""
-    weight = np.linalg.inv(reading.cov[:, :size, :size])
-    squared = np.einsum("ni,nij,nj->n", left[:, :size], weight, left[:, :size])
-    share = np.einsum("nij,nji->n", weight, fitted[:, :size, :size])
+def _readings(reading: Linear, left: Array, fitted: Array, counted: Array, part: slice) -> noise.Readings:
+    """Of some numbers of what is left (m, d). fitted: (m, d, d) covariance of what is explained."""
+    weight = np.linalg.inv(reading.cov[:, part, part])
+    squared = np.einsum("ni,nij,nj->n", left[:, part], weight, left[:, part])
+    share = np.einsum("nij,nji->n", weight, fitted[:, part, part])
+    size = weight.shape[1]
     return noise.Readings(squared, noise.expected(size, share, counted), size, reading.usable)
 
 

@@ -16,6 +16,8 @@ from calib_toolkit.types import Measured
 
 Array = NDArray[np.float64]
 
+UPRIGHT = 0.99
+"""Sine of the pitch from which roll and yaw are one."""
 HELD = 1.0
 """Metres, or their worth in radians, to which numbers must hold a direction that the drive leaves open."""
 NUMBERS = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -27,6 +29,10 @@ def checked(prior: Sequence[Measured], names: Sequence[str]) -> None:
         if m.sensor not in names:
             raise ConfigError(
                 f"the prior tells of '{m.sensor}', which is not calibrated; there are: {', '.join(names)}"
+            )
+        if not np.isfinite(m.value) or not m.sigma > 0:
+            raise ConfigError(
+                f"the prior of {m.sensor}.{m.parameter} has no value, or no sigma above zero; give both"
             )
         if m.sensor == names[0]:
             raise ConfigError(
@@ -48,6 +54,11 @@ def information(T: Array, names: Sequence[str], prior: Sequence[Measured]) -> tu
         error = m.value - _numbers(T[i], np.zeros(6))[k]
         if k >= 3:
             error = (error + np.pi) % (2 * np.pi) - np.pi
+        if k >= 3 and abs(T[i, 2, 0]) > UPRIGHT:
+            raise ConfigError(
+                f"the prior gives an angle of {m.sensor}, which points straight up or down, where roll and yaw can "
+                "not be told apart; give its position only"
+            )
         slope = np.zeros(size)
         slope[6 * (i - 1) : 6 * i] = delta.jacobian(partial(_numbers, T[i]), np.zeros(6))[k]
         total += np.outer(slope, slope) / m.sigma**2

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from calib_toolkit.joint import noise, verdict
 from calib_toolkit.joint.moving import Moving
+from calib_toolkit.joint.readings import WIDENED
 from calib_toolkit.joint.turning import Turning
 from calib_toolkit.sync import Steps
 from calib_toolkit.types import Calibration, Measured, Motions
@@ -35,7 +36,7 @@ def statistics(
         "steps_rejected": steps.rejected,
         "seconds": seconds,
         "rejected": _by_name(c, np.array([np.mean(~k) for k in turned.kept]) if placed is None else placed.rejected),
-        "noise_scale": {n: _noise(turned, placed, i) for i, n in enumerate(c.names)},
+        "noise_scale": {n: _noise(turned, placed, i, bool(c.has_scale[i])) for i, n in enumerate(c.names)},
         "strength": _strengths(c, steps),
         "driving": _driving(c, seconds),
         "bias_deg": None if placed is None else _by_name(c, np.degrees(np.linalg.norm(placed.bias, axis=1))),
@@ -47,13 +48,13 @@ def _by_name(c: Calibration, values: Array) -> dict[str, float]:
     return {n: float(v) for n, v in zip(c.names, values, strict=True)}
 
 
-def _noise(turned: Turning, placed: Moving | None, i: int) -> dict[str, Any]:
-    """By what a sensor's stated variances were multiplied, and whether that was told for it alone or for the pair."""
+def _noise(turned: Turning, placed: Moving | None, i: int, scaled: bool) -> dict[str, Any]:
+    """How many times its usual stated variance a sensor's noise is, and whether that is told for it or for a pair."""
     alone = turned.freedom[i] > noise.VISIBLE
-    found: dict[str, Any] = {"turns": float(turned.scale[i]), "kind": "own" if alone else "pair"}
-    if placed is not None:
+    found: dict[str, Any] = {"turns": WIDENED * float(turned.scale[i]), "kind": "own" if alone else "pair"}
+    if placed is not None and scaled:
         alone = i not in placed.together and placed.freedom[i] > noise.VISIBLE
-        found |= {"shifts": float(placed.scale[i]), "kind_of_shifts": "own" if alone else "pair"}
+        found |= {"shifts": WIDENED * float(placed.scale[i]), "kind_of_shifts": "own" if alone else "pair"}
     return found
 
 

@@ -15,7 +15,7 @@ BLOCK = 5.0
 """Seconds, at least, over which errors may go together; there are at most ``BLOCKS`` of them in a drive."""
 BLOCKS = 60
 FEWEST = 8
-SURE = 0.999
+SURE = 0.9999
 """Share of drives with independent errors that are left alone."""
 
 
@@ -59,7 +59,7 @@ def inflation(
             continue
         found = np.linalg.pinv(cov[np.ix_(own, own)], hermitian=True)
         rank = np.linalg.matrix_rank(found, hermitian=True)
-        total = float(np.einsum("bi,ij,bj->", moved[:, own], found, moved[:, own]))
+        total = blocks * float(np.einsum("bi,ij,bj->", moved[:, own], found, moved[:, own]))
         if total > chi2.ppf(SURE, rank * (blocks - 1)):
             ratio = (moved[:, own] ** 2).sum(axis=0) / np.diag(cov)[own] * blocks / (blocks - 1)
             factor[own] = np.maximum(ratio, 1.0)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.signal import correlate, find_peaks
 
 from calib_toolkit import se3
+from calib_toolkit.errors import DataError
 from calib_toolkit.sync import Chain, Steps
 
 Array = NDArray[np.float64]
@@ -25,7 +26,11 @@ CANDIDATES = 12
 SMOOTH = 4
 """Ticks over which turns are summed up: two readings at 10 Hz."""
 ALIKE = 0.8
-"""Most of two sensors' turning that may be left unexplained by the lag and rotation that are taken."""
+"""Most of two sensors' turning that the lag and rotation that are taken may leave unexplained, to begin with."""
+AGREED, AGREED_SHORT = 0.35, 0.1
+"""The same in the end; and where the sensors share less than half of their time, so that chance may do much."""
+MOVED = 0.6
+"""Share of a sensor's turning that is jitter, from which it may be nothing else."""
 CLIP = 4.0
 """Readings count as if they were no longer than so many times the usual."""
 LEVER = 1.0
@@ -39,6 +44,25 @@ def lags(chains: Sequence[Chain]) -> Array:
     """(n,) by how much each sensor's clock is behind the first's, to half a tick; zero where none stands out."""
     base = _turns(chains[0])
     return np.array([0.0, *(_lag(base, _turns(c)) for c in chains[1:])])
+
+
+def agree(names: Sequence[str], chains: Sequence[Chain]) -> None:
+    """Refuse sensors whose turns can not be those of one vehicle. chains: on one clock. Raises DataError.
+
+    A wrong lag may make a few bends go together, and would otherwise give a confident wrong answer.
+    """
+    a, known_a, start_a = _turns(chains[0])
+    for name, c in zip(names[1:], chains[1:], strict=True):
+        b, known_b, start_b = _turns(c)
+        shift = round((start_b - start_a) / TICK)
+        left, noise = _unexplained(a, b, shift), max(_jitter(a), _jitter(b))
+        short = _common(known_a, known_b, shift) < 0.5 * min(known_a.sum(), known_b.sum())
+        if noise < MOVED and left > (AGREED_SHORT if short else AGREED):
+            raise DataError(
+                f"the turns of {name} and {names[0]} do not go together at any clock offset within {MOST_LATE:g} s, "
+                "or for too short a time; check that both are of one drive, have half of it in common, and count "
+                "their seconds from the same epoch"
+            )
 
 
 def poses(steps: Steps) -> Array:
@@ -91,6 +115,21 @@ def _lag(base: tuple[Array, Array, float], other: tuple[Array, Array, float]) ->
         return 0.0
     k = best[int(np.argmax(worth))]
     return float(dt[k])
+
+
+def _common(known_a: Array, known_b: Array, shift: int) -> float:
+    """Ticks at which both are known."""
+    a, b = (known_a[shift:], known_b) if shift >= 0 else (known_a, known_b[-shift:])
+    n = min(len(a), len(b))
+    return float(a[:n] @ b[:n])
+
+
+def _jitter(turns: Array) -> float:
+    """Share of a sensor's turning (m, 3) that changes from one moment to the next: near one if it is noise alone."""
+    n = len(turns) // SMOOTH * SMOOTH
+    smooth = turns[:n].reshape(-1, SMOOTH, 3).sum(axis=1)
+    power = float((smooth**2).sum())
+    return float((np.diff(smooth, axis=0) ** 2).sum()) / (2 * power) if power > 0 else 1.0
 
 
 def _unexplained(a: Array, b: Array, shift: int) -> float:

@@ -18,6 +18,8 @@ Mask = NDArray[np.bool_]
 
 PERIODS = (1, 4, 16)
 """Of the slower sensor, over which a speed is told: turns change within a second, a speed hardly does."""
+CHANCE = 6.0
+"""Standard deviations of a correlation that is chance, more so at the lag that was chosen for it."""
 FEWEST = 30
 """Readings below which those that were rejected are looked at, too."""
 
@@ -74,7 +76,7 @@ def _told(motions: Sequence[Motions], turned: Turning, known: Sequence[Late]) ->
     told = np.zeros(len(turned.clocks), dtype=bool)
     told[[0, *(k.clock for k in known)]] = True
     for chain, c in zip(chains[1:], turned.clocks.of[1:], strict=True):
-        told[c] |= any(not observability.unmeasured_times("ab", [chains[0], chain], "ab", k) for k in PERIODS)
+        told[c] |= any(not observability.unmeasured_times("ab", [chains[0], chain], "ab", k, CHANCE) for k in PERIODS)
     return told
 
 

@@ -22,7 +22,7 @@ from calib_toolkit.types import Motions
 
 Array = NDArray[np.float64]
 
-SPACING = 0.05
+SPACING = 0.035
 """Seconds between the knots of the signal."""
 STENCIL = np.array([1.0, -2.0, 1.0])
 SMOOTHEST = 1e-4
@@ -85,7 +85,8 @@ def estimate(motions: Sequence[Motions], R: Array, clocks: Clocks, known: Sequen
     if own.any():
         rounds, solved, correction = search.maximise(free | own)
     _, cov = _step(solved, correction, free | own)
-    wider = np.sqrt(spread.inflation(search.pulls(solved), search.stamps(), cov, cov, _groups(len(motions), others)))
+    stamps = [search.clocks.base_time(i, m.start) for i, m in enumerate(motions)]
+    wider = np.sqrt(spread.inflation(search.pulls(solved), stamps, cov, cov, _groups(len(motions), others)))
     cov = cov * np.outer(wider, wider)
     kept = tuple(w > 0 for w in search.weights)
     freedom = noise.freedoms(search.readings, search.kept)
@@ -106,6 +107,7 @@ class _Search:
         n = len(motions)
         self.motions, self.R, self.known, self.scale = motions, R.copy(), known, np.ones(n)
         self.start = self.clocks = clocks
+        self.R_start = R
         self.parameters = 3 * (n - 1) + 2 * (len(clocks) - 1)
         ends = [(clocks.base_time(i, m.start).min(), clocks.base_time(i, m.end).max()) for i, m in enumerate(motions)]
         self.first, last = min(a for a, _ in ends) - 10 * SPACING, max(b for _, b in ends) + 10 * SPACING
@@ -174,7 +176,9 @@ class _Search:
         arrow.add_prior(STENCIL, self.rates, np.asarray(np.linalg.inv(self.rough), dtype=np.float64))
         arrow.hold(0, 1e-9)
         arrow.hold(len(self.rates) - 1, 1e-9)
-        arrow.information += np.diag(1 / np.repeat([TURN, LATE, SKEW], [turns, others, others]) ** 2)
+        wide = 1 / np.repeat([TURN, LATE, SKEW], [turns, others, others]) ** 2
+        arrow.information += np.diag(wide)
+        arrow.gradient -= wide * self.gone()
         for k in self.known:
             column = self.clock_columns(k.clock)[0]
             arrow.information[column, column] += 1 / k.sigma**2
@@ -223,10 +227,6 @@ class _Search:
             found.append(np.einsum("ndp,nde,ne->np", by_parameter, weight, s.residual))
         return found
 
-    def stamps(self) -> list[Array]:
-        """(n) of (m,) base time of each reading."""
-        return [self.clocks.base_time(i, m.start) for i, m in enumerate(self.motions)]
-
     def rougher(self, solved: Solved) -> Array:
         """(3, 3) the covariance that the signal's second differences show, less what of them is not known.
 
@@ -254,6 +254,11 @@ class _Search:
         late, skew = step[turns : turns + others], step[turns + others :]
         late = np.clip(late, -MOST_LATE, MOST_LATE)
         self.clocks = self.clocks.moved(np.append(0.0, late), np.append(0.0, skew)).within(self.start, LATE)
+
+    def gone(self) -> Array:
+        """(p,) how far the parameters are from where they started."""
+        turned = se3.log_so3(self.R[1:] @ np.swapaxes(self.R_start[1:], 1, 2)).ravel()
+        return np.concatenate([turned, self.clocks.dt[1:] - self.start.dt[1:], self.clocks.skew[1:]])
 
     def clock_columns(self, clock: int) -> list[int]:
         """Where a clock's offset and skew are among the parameters."""
