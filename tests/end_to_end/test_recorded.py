@@ -161,7 +161,7 @@ def test_kitti_velodyne_and_four_cameras_over_the_whole_drive(motions, truth):
         assert np.abs(error[:2]).max() < 0.15
         assert abs(error[2]) < 0.38
         # measured: 0.52 to 0.56 degrees
-        assert 0.4 < result.statistics["bias_deg"][f"cam{i}"] < 0.7
+        assert 0.4 < result.statistics["bias_deg"][f"cam{i - 1}"] < 0.7
     offsets = 1e3 * (c.dt_base_sensor[1:] - c.dt_base_sensor[1] - KITTI_OFFSETS)
     # measured, ms: -0.10, 0.08, 0.05
     assert np.abs(offsets).max() < 0.2

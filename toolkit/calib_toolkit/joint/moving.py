@@ -17,7 +17,7 @@ from calib_toolkit.joint import noise, turning
 from calib_toolkit.joint.arrow import Arrow, Solved
 from calib_toolkit.joint.clocks import Clocks
 from calib_toolkit.joint.model import Linear, linear, read
-from calib_toolkit.joint.readings import travel
+from calib_toolkit.joint.readings import WIDENED, travel
 from calib_toolkit.joint.windows import Index, Windows, coning, splines
 from calib_toolkit.types import Motions
 
@@ -141,7 +141,7 @@ class _Search:
         self.twists = base.summed(middles)
         least = SLIGHT / np.median(np.einsum("nii->ni", motions[0].cov), axis=0)
         self.hold = np.maximum(1 / (LOOSE * np.var(np.diff(self.twists, 3, axis=0), axis=0) + 1e-12), least)
-        sigma = np.sqrt(np.median(np.trace(motions[0].cov[:, :3, :3], axis1=1, axis2=2)) / 3)
+        sigma = np.sqrt(np.median(np.trace(motions[0].cov[:, :3, :3], axis1=1, axis2=2)) / 3 / WIDENED)
         self.far = [
             np.full(len(m), m.has_scale) | (_travel(base, a, b) > LEAST_TRAVEL * sigma)
             for m, (a, b) in zip(motions, spans, strict=True)

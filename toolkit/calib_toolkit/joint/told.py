@@ -18,7 +18,7 @@ Mask = NDArray[np.bool_]
 
 PERIODS = (1, 4, 16)
 """Of the slower sensor, over which a speed is told: turns change within a second, a speed hardly does."""
-CHANCE = 6.0
+CHANCE = 4.5
 """Standard deviations of a correlation that is chance, more so at the lag that was chosen for it."""
 FEWEST = 30
 """Readings below which those that were rejected are looked at, too."""
