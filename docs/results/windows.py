@@ -33,7 +33,8 @@ def main(recording: str, sensors: Sequence[str], seconds: float, method: str = "
         apart, sigma = differences(found, name)
         rows = {"sd of parts": np.nanstd(apart, axis=0, ddof=1), "stated sigma, median": np.nanmedian(sigma, axis=0)}
         if log.reference is not None and {name, found[0].base} <= set(log.reference.names):
-            rows["mean less reference"] = np.nanmean([against(c, log.reference, name) for c in found], axis=0)
+            shifts = np.nanmean([against(c, log.reference, name) for c in found], axis=0)
+            rows["mean less reference"] = np.append(shifts, np.nan)
         for title, values in rows.items():
             cells = ["-" if np.isnan(v) else f"{v:.3g}" for v in values * UNITS]
             print(f"| {name} | {title} | {' | '.join(cells)} |")
@@ -46,12 +47,11 @@ def differences(found: Sequence[Calibration], name: str) -> tuple[Array, Array]:
 
 
 def against(c: Calibration, reference: Calibration, name: str) -> Array:
-    """(7,) of a part, less the reference; the clocks of which are not compared."""
+    """(6,) of a part's pose, less the reference."""
     T = reference.between(c.base, name).T_a_b
     i = c.index(name)
     turn = se3.log_so3(c.T_base_sensor[i, :3, :3] @ T[:3, :3].T)
-    difference = np.concatenate([c.T_base_sensor[i, :3, 3] - T[:3, 3], turn, [np.nan]])
-    return np.where(c.determined[i], difference, np.nan)
+    return np.where(c.determined[i, :6], np.concatenate([c.T_base_sensor[i, :3, 3] - T[:3, 3], turn]), np.nan)
 
 
 def _less(a: Calibration, b: Calibration, i: int, j: int) -> Array:
