@@ -135,3 +135,9 @@ def test_numbers_of_strangers_and_of_the_base_are_refused():
         prior.checked([Measured("radar", "z", 1.0, 0.1)], NAMES)
     with pytest.raises(ConfigError, match=r"'velo'.*--base"):
         prior.checked([Measured("velo", "z", 1.0, 0.1)], NAMES)
+
+
+def test_measured_poses_of_cameras_alone_are_refused_and_offsets_are_not():
+    prior.without_scale([Measured("cam1", "dt", 0.01, 0.001)])
+    with pytest.raises(ConfigError, match=r"cam1\.z.*cameras alone"):
+        prior.without_scale([Measured("cam1", "dt", 0.01, 0.001), Measured("cam1", "z", 0.5, 0.01)])

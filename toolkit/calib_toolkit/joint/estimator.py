@@ -75,6 +75,8 @@ def calibrate(motions: Mapping[str, Motions], config: Config, clocks: Sequence[s
 
 def _calibrate(motions: Mapping[str, Motions], config: Config, clocks: Sequence[str], progress: Progress) -> Result:
     progress.begin(STAGES, 2)
+    if not any(m.has_scale for m in motions.values()):
+        prior.without_scale(config.prior)
     timed = _time(motions, clocks, config.prior)
     progress.advance(STAGES, 1)
     turned = _turn(timed)

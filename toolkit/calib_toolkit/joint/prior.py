@@ -40,6 +40,15 @@ def checked(prior: Sequence[Measured], names: Sequence[str]) -> None:
             )
 
 
+def without_scale(prior: Sequence[Measured]) -> None:
+    """Refuse numbers on poses where no sensor measures distances: they would be left unused. Raises ConfigError."""
+    if unused := [f"{m.sensor}.{m.parameter}" for m in prior if m.parameter in NUMBERS]:
+        raise ConfigError(
+            f"the prior tells {', '.join(unused)}, but cameras alone give no positions and take no measured poses; "
+            "add a sensor that measures distances, or leave them out"
+        )
+
+
 def information(T: Array, names: Sequence[str], prior: Sequence[Measured]) -> tuple[Array, Array]:
     """What the numbers say of poses T (n, 4, 4): information (6(n-1),) squared and gradient (6(n-1),).
 

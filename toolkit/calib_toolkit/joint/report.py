@@ -40,6 +40,7 @@ def statistics(
         "strength": _strengths(c, steps),
         "driving": _driving(c, seconds),
         "bias_deg": None if placed is None else _by_name(c, np.degrees(np.linalg.norm(placed.bias, axis=1))),
+        "rounds": {"turning": turned.rounds, "moving": 0 if placed is None else placed.rounds},
         "prior": [f"{m.sensor}.{m.parameter}" for m in prior],
     }
 
