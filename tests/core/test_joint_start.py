@@ -58,7 +58,7 @@ def test_recordings_with_little_in_common_are_put_right(seed, common):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("seed", "common"), [(1, 0.0), (2, 8.0)])
+@pytest.mark.parametrize(("seed", "common"), [(1, 0.0), (2, 8.0), (3, 8.0)])
 def test_recordings_with_too_little_in_common_are_refused_or_put_right(seed, common):
     motions = dict(zip(("velo", "ins"), recordings(seed, common, 0.02), strict=True))
     try:

@@ -28,7 +28,8 @@ SMOOTH = 4
 ALIKE = 0.8
 """Most of two sensors' turning that the lag and rotation that are taken may leave unexplained, to begin with."""
 AGREED, AGREED_SHORT = 0.35, 0.1
-"""The same in the end; and where the sensors share less than half of their time, so that chance may do much."""
+"""The same in the end; and where the sensors share less than LONG of their time, so that chance may do much."""
+LONG = 0.75
 MOVED = 0.6
 """Share of a sensor's turning that is jitter, from which it may be nothing else."""
 CLIP = 4.0
@@ -56,7 +57,7 @@ def agree(names: Sequence[str], chains: Sequence[Chain]) -> None:
         b, known_b, start_b = _turns(c)
         shift = round((start_b - start_a) / TICK)
         left, noise = _unexplained(a, b, shift), max(_jitter(a), _jitter(b))
-        short = _common(known_a, known_b, shift) < 0.5 * min(known_a.sum(), known_b.sum())
+        short = _common(known_a, known_b, shift) < LONG * min(known_a.sum(), known_b.sum())
         if noise < MOVED and left > (AGREED_SHORT if short else AGREED):
             raise DataError(
                 f"the turns of {name} and {names[0]} do not go together at any clock offset within {MOST_LATE:g} s, "
