@@ -121,7 +121,7 @@ class _Search:
     ) -> None:
         n = len(motions)
         self.motions, self.T, self.clocks = motions, T.copy(), clocks
-        self.turn_scale = self.least_turn_scale = turn_scale
+        self.turn_scale = turn_scale
         self.free, self.prior, self.bias = free, prior, np.zeros((n, 3))
         # of two sensors' distances only the sum of the noise shows; how it divides, each one's own jitter tells
         self.together = [i for i, m in enumerate(motions) if m.has_scale]
@@ -202,7 +202,7 @@ class _Search:
         self.scale = self.scale * noise.damped(change, round_)
         # what one cubic a reading leaves of the turns is noise here, which the first stage had no need of
         turned = noise.ratios(turns, self.kept, round_, self.turn_scale)
-        self.turn_scale = np.maximum(self.turn_scale * noise.damped(turned, round_), self.least_turn_scale)
+        self.turn_scale = self.turn_scale * noise.damped(turned, round_)
         return change
 
     def move(self, step: Array, solved: Solved) -> None:
