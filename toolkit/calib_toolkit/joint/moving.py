@@ -41,6 +41,7 @@ BIASED = 0.05
 FAR = 30.0
 """Metres or radians: what the drive tells nothing of is no further from where it started."""
 ROUNDS = 30
+LEAST_SCALE = 0.1  # of the first stage's scale of turns: readings without any noise would have no end
 CLOSE = 0.01
 DRAWS = 2
 """Of the motion's error, to tell what noise feigns."""
@@ -121,7 +122,7 @@ class _Search:
     ) -> None:
         n = len(motions)
         self.motions, self.T, self.clocks = motions, T.copy(), clocks
-        self.turn_scale = turn_scale
+        self.turn_scale = self.first_turn_scale = turn_scale
         self.free, self.prior, self.bias = free, prior, np.zeros((n, 3))
         # of two sensors' distances only the sum of the noise shows; how it divides, each one's own jitter tells
         self.together = [i for i, m in enumerate(motions) if m.has_scale]
@@ -200,9 +201,9 @@ class _Search:
         self.kept = [(a > 0) & (b > 0) & s.usable for a, b, s in zip(before, self.weights, self.shifts, strict=True)]
         change = noise.ratios(self.shifts, self.kept, round_, self.scale, self.together)
         self.scale = self.scale * noise.damped(change, round_)
-        # what one cubic a reading leaves of the turns is noise here, which the first stage had no need of
-        turned = noise.ratios(turns, self.kept, round_, self.turn_scale)
-        self.turn_scale = self.turn_scale * noise.damped(turned, round_)
+        # one cubic a reading leaves more of the turns to noise than the first stage did
+        scale = self.turn_scale * noise.damped(noise.ratios(turns, self.kept, round_, self.turn_scale), round_)
+        self.turn_scale = np.maximum(scale, LEAST_SCALE * self.first_turn_scale)
         return change
 
     def move(self, step: Array, solved: Solved) -> None:
