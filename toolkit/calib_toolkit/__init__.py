@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from calib_toolkit.hookspecs import Sensor as Sensor
     from calib_toolkit.hookspecs import SensorTable as SensorTable
     from calib_toolkit.hookspecs import hookimpl as hookimpl
+    from calib_toolkit.paths import poses_at as poses_at
     from calib_toolkit.pipeline import calibrate as calibrate
     from calib_toolkit.pipeline import calibrate_motions as calibrate_motions
     from calib_toolkit.pipeline import open_log as open_log
@@ -58,6 +59,7 @@ _HOMES = {
             "hookimpl",
         ),
     ],
+    "calib_toolkit.paths": ["poses_at"],
     "calib_toolkit.pipeline": ["calibrate", "calibrate_motions", "open_log"],
     "calib_toolkit.progress": ["Progress"],
     "calib_toolkit.result_file": ["read_calibration", "write_calibration"],

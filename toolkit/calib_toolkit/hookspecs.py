@@ -14,7 +14,7 @@ import numpy as np
 import pluggy
 from numpy.typing import NDArray
 
-from calib_toolkit.types import Calibration, Log, Motions, Pair, PairEstimate, Stream, Trajectory
+from calib_toolkit.types import Calibration, Log, Motions, Pair, PairEstimate, Stream, Trajectory, Transform
 
 hookspec = pluggy.HookspecMarker("calib_toolkit")
 hookimpl = pluggy.HookimplMarker("calib_toolkit")
@@ -74,7 +74,11 @@ class Metric(Protocol):
 
 
 class CostMetric(ABC):
-    """A metric that only says how bad a pose is; the core searches for the best one."""
+    """A metric that only says how bad a pose is at one moment; the core searches for the best over all of them.
+
+    ``accepts`` and ``cost`` are enough. The others make it faster: what does not depend on the pose is done once in
+    ``prepare``, and ``costs`` may take many poses at a time.
+    """
 
     id: str
     options: type = NoOptions
@@ -84,12 +88,33 @@ class CostMetric(ABC):
         """Whether it can compare these kinds of sensors, in this order."""
 
     @abstractmethod
-    def cost(self, T_a_b: NDArray[np.float64], pair: Pair) -> float:
-        """Lower is better. T_a_b: (4, 4)."""
+    def cost(self, T_a_b: NDArray[np.float64], pair: Any) -> float:
+        """Lower is better; on average over moments, where lengths of drive do not matter. T_a_b: (4, 4).
+
+        pair: what ``focus`` returned; unless overridden, the Pair with one row selected.
+        """
 
     def overlap(self, pair: Pair) -> bool:
         """Whether the two see enough of the same place to compare (by default: assume so)."""
         return len(pair.selected) > 0
+
+    def prepare(self, pair: Pair, options: Any) -> Any:
+        """One moment, of which one row is selected, made ready; None if it has nothing to compare."""
+        return pair
+
+    def focus(self, moment: Any, around: Transform, blur: float) -> Any:
+        """The moment for poses about as far from ``around`` as its covariance says.
+
+        blur: how many times smoother than in the end the picture may be, so that the search sees further.
+        """
+        return moment
+
+    def draw(self, pair: Pair, poses: Mapping[str, NDArray[np.float64]], folder: Path) -> None:  # noqa: B027
+        """Pictures in a folder by which a person can judge poses (4, 4), by name; nothing unless overridden."""
+
+    def costs(self, T_a_b: NDArray[np.float64], moment: Any) -> NDArray[np.float64]:
+        """(k,) of many poses (k, 4, 4)."""
+        return np.array([self.cost(T, moment) for T in T_a_b])
 
 
 @dataclass(frozen=True)
