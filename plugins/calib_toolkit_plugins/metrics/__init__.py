@@ -1,1 +1,1 @@
-"""Appearance metrics, one per file (to come)."""
+"""Appearance metrics, one per file, and what they share: a scan as a camera sees it, pictures of both."""
