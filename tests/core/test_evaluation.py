@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from calib_toolkit import CameraIntrinsics, Config, Log, Stream, config, paper, pipeline, se3
 from calib_toolkit.config import METHODS
-from calib_toolkit.errors import ConfigError, DataError, NotObservableError
+from calib_toolkit.errors import DataError, NotObservableError
 from calib_toolkit.evaluation import baselines, drives, experiment, figures, measures, panorama, summary
 from calib_toolkit.evaluation.errors import euler_sigma, rotation_error, rotation_sigma
 from calib_toolkit.evaluation.measures import FORWARD_LEFT_UP, measure_pair, measure_panoramic, measure_timing
 from calib_toolkit.evaluation.paper import beside
-from calib_toolkit.evaluation.protocols import PROTOCOLS, protocol
+from calib_toolkit.evaluation.protocols import PROTOCOLS
 from calib_toolkit.evaluation.sections import Draw, cut, plan
 from calib_toolkit.evaluation.store import Store
 from calib_toolkit.progress import Silent
@@ -443,12 +443,6 @@ def test_roll_of_a_camera_is_about_its_optical_axis():
 # ---- protocols
 
 
-@pytest.mark.parametrize("name", ["appearance", "full"])
-def test_experiments_on_appearance_say_what_they_wait_for(name):
-    with pytest.raises(ConfigError, match=rf"'{name}' \(Fig\. 1.*no installed plugin brings one; run one of: timing"):
-        protocol(name)
-
-
 def test_the_papers_lengths_and_spreads_are_the_defaults():
     assert PROTOCOLS["timing"].seconds == tuple(range(10, 201, 10))
     assert PROTOCOLS["timing"].spreads == (0.1, 1.0)
@@ -717,7 +711,7 @@ def test_lines_come_by_spread_then_length():
 # ---- pictures
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("name", [n for n, p in PROTOCOLS.items() if not p.sees])
 def test_figures_are_drawn(name, two, ring, tmp_path):
     from matplotlib.image import imread
 
@@ -757,7 +751,7 @@ def full_table(name):
     return rows
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("name", [n for n, p in PROTOCOLS.items() if not p.sees])
 def test_in_a_full_figure_every_estimator_has_its_colour_and_no_text_lies_on_another(name, monkeypatch):
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

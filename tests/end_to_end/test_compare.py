@@ -190,7 +190,7 @@ def run(tmp_path, monkeypatch):
     given = []
     monkeypatch.setattr(
         "calib_toolkit.pipeline.calibrate",
-        lambda log, config, *more: given.append(config) or Result(rig(), {}),
+        lambda log, config, *more, **others: given.append(config) or Result(rig(), {}),
     )
 
     def run(prior, *arguments):

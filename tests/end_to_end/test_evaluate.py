@@ -274,10 +274,10 @@ def test_a_drive_without_truth_is_refused_and_a_given_one_taken(no_truth, tmp_pa
     assert max(float(row["rotation_deg"]) for row in rows_of(tmp_path / "out" / "pair.csv")) < 1
 
 
-@pytest.mark.parametrize("name", ["appearance", "full"])
-def test_experiments_on_appearance_are_refused(drive, tmp_path, name):
+@pytest.mark.parametrize(("name", "what"), [("appearance", "lidar and camera"), ("full", "two sensors")])
+def test_experiments_on_appearance_are_refused_where_nothing_can_be_compared(drive, tmp_path, name, what):
     sentence = refused(name, drive, "-o", tmp_path / "out")
-    assert "no installed plugin brings one; run one of: timing, pair, panoramic" in sentence
+    assert f"no {what} that an installed appearance metric compares" in sentence
     assert not (tmp_path / "out").exists()
 
 

@@ -32,7 +32,9 @@ class Config:
 
     base: the sensor all poses are given in; None for the first that has scale. start, duration: the part of the
     drive to use, seconds from its first stamp. jobs: processes for the sensors' own motion. sensors: options of
-    the sensor plugins, by sensor name or kind. prior: numbers that were measured by hand.
+    the sensor plugins, by sensor name or kind. prior: numbers that were measured by hand. appearance: metrics that
+    refine what the motion tells, or ("none",). moments: of each pair, at which appearance is compared. metrics:
+    options of the metrics, by id.
     """
 
     method: str = "joint"
@@ -47,18 +49,24 @@ class Config:
     translation: TranslationOptions = field(default_factory=TranslationOptions)
     sensors: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     prior: tuple[Measured, ...] = ()
+    appearance: tuple[str, ...] = ("im", "matching", "map")
+    moments: int = 25
+    metrics: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise ConfigError(f"there is no method '{self.method}'; there are: {', '.join(METHODS)}")
         if self.timing.start not in ("correlation", "zero"):
             raise ConfigError(f"timing.start = '{self.timing.start}' is neither 'correlation' nor 'zero'")
+        if not self.appearance or not all(isinstance(m, str) for m in self.appearance):
+            raise ConfigError(f"appearance = {self.appearance!r} is no list of metrics; name some, or none")
         if not isinstance(self.base, str | None):
             raise ConfigError(f"base = {self.base!r} is not the name of a sensor")
         for name, value, least, below in (
             ("start", self.start, 0.0, np.inf),
             ("duration", 1.0 if self.duration is None else self.duration, TINY, np.inf),
             ("jobs", self.jobs, 1, np.inf),
+            ("moments", self.moments, 8, 1001),
             ("sync.gate", self.sync.gate, TINY, np.inf),
             ("timing.steps", self.timing.steps, 100, 1_000_001),
             ("timing.max_offset", self.timing.max_offset, TINY, np.inf),
@@ -111,6 +119,8 @@ def _same_type(current: Any, value: Any, where: str) -> Any:
         return float(value)
     if current is None:
         return value
+    if isinstance(current, tuple) and isinstance(value, list):
+        return tuple(value)
     if type(value) is not type(current):
         raise ConfigError(f"{where} is {value!r}, where a {type(current).__name__} is expected")
     return value

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from calib_toolkit import cache, joint, paper
+from calib_toolkit import appearance, cache, joint, paper
 from calib_toolkit.config import Config
 from calib_toolkit.errors import ConfigError, DataError
 from calib_toolkit.estimation import SensorMotion, estimate_motions
@@ -36,10 +36,12 @@ def calibrate(
     plugins: Registry | None = None,
     progress: Progress | None = None,
     cache_folder: Path | None = None,
+    pictures: Path | None = None,
 ) -> Result:
     """Where every sensor of the log sits and how late its clock is. Raises CalibrationError.
 
-    First each sensor's own motion, then :func:`calibrate_motions`.
+    First each sensor's own motion, then :func:`calibrate_motions`, then what pairs that see the same place look like.
+    pictures: folder for overlays of each pair before and after that.
     """
     config, plugins, progress = config or Config(), plugins or registry(), progress or Silent()
     log = log.trim(config.start, config.duration)
@@ -47,7 +49,9 @@ def calibrate(
     names = _base_first(moved, config.base)
     skipped = [*log.notes, *(note for n in names for note in (*log.streams[n].notes, *moved[n].notes))]
     clocks = [log.streams[n].clock for n in names]
-    return calibrate_motions({n: moved[n].motions for n in names}, config, clocks, skipped, progress)
+    result = calibrate_motions({n: moved[n].motions for n in names}, config, clocks, skipped, progress)
+    whole = {n: moved[n].motion for n in names}
+    return appearance.refine(result, log, whole, config, plugins, progress, pictures)
 
 
 def sensor_motions(
@@ -76,7 +80,11 @@ def calibrate_motions(
     """
     config = config or Config()
     found = METHODS[config.method].calibrate(motions, config, clocks or tuple(motions), progress or Silent())
-    chosen = {**asdict(config), "prior": [asdict(m) for m in config.prior]}
+    chosen = {
+        **asdict(config),
+        "prior": [asdict(m) for m in config.prior],
+        "appearance": list(config.appearance),
+    }
     return replace(found, warnings=tuple(warnings), configuration=chosen)
 
 

@@ -16,6 +16,7 @@ from calib_toolkit.errors import CalibrationError, PluginError
 COMMANDS = {
     "run": "Calibrate the sensors of a drive.",
     "inspect": "Show what a recording holds and what is wrong with it.",
+    "check": "Tell whether small moves would improve a calibration.",
     "compare": "Tell whether two results of one rig agree.",
     "evaluate": "Repeat the paper's experiments on drives whose truth is known.",
     "plugins": "List what is installed, and where from.",

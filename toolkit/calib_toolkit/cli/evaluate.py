@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -12,7 +13,9 @@ if TYPE_CHECKING:
 
 NAMES = ("timing", "pair", "panoramic", "appearance", "full")
 LEFT_TO_THE_FILE = ("mean", "RMS", "sigma", "sections", "no truth", "paper")
-"""Columns of the summary that a terminal has no room for."""
+"""Columns of the summary that a terminal has no room for, those of a sigma with whatever follows."""
+WORDS = ("estimator", "sensor", "metric", "search")
+"""Columns that hold no numbers."""
 
 
 def _methods(ctx: click.Context, param: click.Parameter, given: tuple[str, ...]) -> tuple[str, ...]:
@@ -50,7 +53,21 @@ def _methods(ctx: click.Context, param: click.Parameter, given: tuple[str, ...])
     metavar="NAME",
     multiple=True,
     callback=_methods,
-    help="Estimator to compare, again for each; all of them by default. Baselines use the first one's clock offsets.",
+    help="Estimator to compare, again for each; all of them by default. Baselines use the first one's clock offsets, "
+    "'appearance' its sigmas.",
+)
+@click.option(
+    "--appearance",
+    "metrics",
+    metavar="A,B,...",
+    help="Metrics of 'appearance' (all that search a pose by default) and 'full' (those of a run by default).",
+)
+@click.option(
+    "--wider",
+    type=click.FloatRange(min=0.0, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="Times the motion's sigma that the starts of 'appearance' are drawn with.",
 )
 @click.option("--jobs", type=click.IntRange(min=1), help="Processes; one for each core by default.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the sections.")
@@ -67,22 +84,27 @@ def evaluate(
     seconds: str | None,
     baseline: bool,
     methods: tuple[str, ...],
+    metrics: str | None,
+    wider: float,
     jobs: int | None,
     seed: int,
 ) -> None:
     """Repeat one of the paper's experiments on random sections of drives whose truth is known.
 
-    PROTOCOL is timing (clock offsets), pair (two sensors), panoramic (a ring of cameras), appearance or full. Writes
-    a table, a summary and a figure to the folder; the same command goes on where a killed one stopped. Exit status 0
-    when every repeat has its rows, refused ones included; 3 when some failed in a way that nobody foresaw; 1 when
-    nothing can be compared, with the reason; 2 for wrong usage.
+    PROTOCOL is timing (clock offsets), pair (two sensors), panoramic (a ring of cameras), appearance (a lidar and a
+    camera, by each metric) or full (all sensors by motion and appearance). Writes a table, a summary and a figure to
+    the folder; the same command goes on where a killed one stopped. Exit status 0 when every repeat has its rows,
+    refused ones included; 3 when some failed in a way that nobody foresaw; 1 when nothing can be compared, with the
+    reason; 2 for wrong usage.
     """
     from calib_toolkit.cli.bars import bars
     from calib_toolkit.config import Config
-    from calib_toolkit.evaluation import experiment, figures, panorama, store, summary
+    from calib_toolkit.evaluation import experiment, figures, panorama, shares, store, summary
     from calib_toolkit.evaluation.drives import open_drives
     from calib_toolkit.evaluation.errors import UNEXPECTED, UNITS
     from calib_toolkit.evaluation.protocols import protocol as named
+    from calib_toolkit.evaluation.sights import asked, metrics_of
+    from calib_toolkit.plugins import registry
     from calib_toolkit.result_file import read_calibration
 
     chosen = named(protocol)
@@ -90,7 +112,11 @@ def evaluate(
     config = Config(seed=seed, jobs=jobs or os.cpu_count() or 1)
     known = read_calibration(truth) if truth else None
     names = _names(sensors)
-    choices = experiment.Choices(repeats, lengths, methods, baseline)
+    if metrics is not None:
+        config = replace(config, appearance=tuple(m.strip() for m in metrics.split(",") if m.strip()))
+    if chosen.sees:
+        asked(config, registry())
+    choices = experiment.Choices(repeats, lengths, methods, baseline, wider)
     chosen.estimators(methods, baseline)  # refuses what does not go together
 
     def check(truths: "Mapping[str, Calibration]") -> None:
@@ -99,12 +125,16 @@ def evaluate(
 
     with bars() as progress:
         opened = open_drives(drives, (lambda _: names) if names else chosen.choose, known, check, config, progress)
+        if chosen.by_metric:
+            config = replace(config, appearance=metrics_of(opened[0].log, config, registry()))
         done = experiment.run(protocol, opened, out, choices, config, progress)
     notes = [f"{d.name}: {note}" for d in opened for note in d.notes] + experiment.notes(protocol, choices)
     if protocol == "panoramic":
         notes.append(panorama.draw(opened[0], done.rows, out / "panorama.png"))
     figures.draw(protocol, done.rows, out / f"{protocol}.png")
     (out / f"{protocol}.md").write_text(summary.markdown(protocol, done, notes), encoding="utf-8")
+    for title, lines in shares.tables(protocol, done.rows):
+        _show(title, lines)
     for parameter in chosen.short:
         _show(f"{parameter}, {UNITS[parameter]}", summary.table(protocol, done.rows, parameter))
     refused = sum(row["status"] == "refused" for row in done.rows)
@@ -127,10 +157,10 @@ def _show(title: str, lines: list[list[str]]) -> None:
     if not lines:
         return
     told = [any(cells) for cells in zip(*lines[1:], strict=True)]
-    shown = [k for k, column in enumerate(lines[0]) if told[k] and column not in LEFT_TO_THE_FILE]
+    shown = [k for k, column in enumerate(lines[0]) if told[k] and not column.startswith(LEFT_TO_THE_FILE)]
     table = Table(title=title, title_justify="left", box=None, padding=(0, 2, 0, 0))
     for k in shown:
-        side: Literal["left", "right"] = "left" if lines[0][k] == "estimator" else "right"
+        side: Literal["left", "right"] = "left" if lines[0][k] in WORDS else "right"
         table.add_column(lines[0][k].replace(" ", "\n"), justify=side, no_wrap=True)
     for cells in lines[1:]:
         table.add_row(*(cells[k] for k in shown))

@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 @click.option("--start", type=float, help="Seconds to skip.")
 @click.option("--duration", type=float, help="Seconds to use.")
 @click.option("--method", type=click.Choice(["joint", "paper"]), help="Estimator; joint by default.")
+@click.option(
+    "--appearance",
+    metavar="M,M,...",
+    help="Metrics that refine the motion's result where sensors see the same; none stops after motion.",
+)
 @click.option("--config", "config_file", type=click.Path(path_type=Path), help="TOML file of options.")
 @click.option(
     "--prior", "prior_file", metavar="FILE", type=click.Path(path_type=Path), help="TOML of measured numbers."
@@ -36,6 +41,7 @@ def run(
     sensors: str | None,
     out: Path | None,
     format_id: str | None,
+    appearance: str | None,
     config_file: Path | None,
     prior_file: Path | None,
     plugins: tuple[Path, ...],
@@ -60,13 +66,15 @@ def run(
     given = {name: value for name, value in chosen.items() if value is not None}
     # click has seen to the types
     config = replace(read_config(config_file) if config_file else Config(), **given)  # type: ignore[arg-type]
+    if appearance is not None:
+        config = replace(config, appearance=tuple(m.strip() for m in appearance.split(",") if m.strip()))
     if prior_file:
         config = _with_prior(config, prior_file)
     installed = registry(plugins)
     log = open_log(drive, format_id, installed).select(_names(sensors))
     file = _writable(out) if out else None
     with bars() as progress:
-        result = calibrate(log, config, installed, progress)
+        result = calibrate(log, config, installed, progress, pictures=out / "overlay" if out else None)
     if file is not None:
         write_result(result, file)
     span = log.trim(config.start, config.duration).span

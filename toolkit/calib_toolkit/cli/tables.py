@@ -80,6 +80,7 @@ def notes(result: Result) -> list[str]:
             f"travel is turned against turns: {', '.join(turned)}; a fault of that sensor's own motion, or of "
             f"{result.calibration.base}'s if all have it; the rotation is taken from turns alone"
         )
+    sentences += found.get("left_out", [])
     return [*sentences, *_longer(found.get("driving", {}), found.get("seconds", 0.0))]
 
 

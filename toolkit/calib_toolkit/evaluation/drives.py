@@ -1,7 +1,8 @@
 """The recordings of an experiment: how each sensor moved, and the truth to compare with."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,11 @@ from numpy.typing import NDArray
 from calib_toolkit.cache import default_folder
 from calib_toolkit.config import Config
 from calib_toolkit.errors import DataError
+from calib_toolkit.hookspecs import CostMetric
 from calib_toolkit.pipeline import open_log, sensor_motions
 from calib_toolkit.plugins import registry
 from calib_toolkit.progress import Progress
-from calib_toolkit.types import Calibration, Log, Motions
+from calib_toolkit.types import Calibration, Log, Motions, Trajectory
 
 Array = NDArray[np.float64]
 
@@ -21,7 +23,8 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True)
 class Drive:
     """One recording. motions: of the sensors compared, the base first. clocks: (n,) sensors that name the same clock
-    share it. truth: of these sensors, in that order. notes: sentences on readings that were left out.
+    share it. truth: of these sensors, in that order. notes: sentences on readings that were left out. paths: the
+    motions as the sensors told them, where some tell poses.
     """
 
     name: str
@@ -30,6 +33,7 @@ class Drive:
     clocks: tuple[str, ...]
     truth: Calibration
     notes: tuple[str, ...] = ()
+    paths: Mapping[str, Motions | Trajectory] = field(default_factory=dict)
 
     @property
     def span(self) -> tuple[float, float]:
@@ -68,7 +72,8 @@ def open_drives(
         motions = {n: moved[n].motions for n in log.streams}
         clocks = tuple(s.clock for s in log.streams.values())
         notes = (*log.notes, *(note for n, s in log.streams.items() for note in (*s.notes, *moved[n].notes)))
-        drives.append(Drive(name, log, motions, clocks, truths[name], notes))
+        whole = {n: moved[n].motion for n in log.streams}
+        drives.append(Drive(name, log, motions, clocks, truths[name], notes, whole))
     return drives
 
 
@@ -91,6 +96,29 @@ def first_two(log: Log) -> list[str]:
             f"{log.source} has no two sensors that measure distances; name the two to compare with --sensors"
         )
     return found[:2]
+
+
+def everyone(log: Log) -> list[str]:
+    """All sensors of the recording. Raises DataError if no installed metric takes two of them."""
+    metrics = registry().metrics.values()
+    if not any(m.accepts(a.kind, b.kind) for a, b in permutations(log.streams.values(), 2) for m in metrics):
+        raise DataError(
+            f"{log.source} has no two sensors that an installed appearance metric compares (it has: {_kinds(log)}); "
+            "use 'pair' or 'panoramic', which look at motion alone"
+        )
+    return list(log.streams)
+
+
+def lidar_and_camera(log: Log) -> list[str]:
+    """The first two sensors that a searched metric takes. Raises DataError if there are none."""
+    metrics = [m for m in registry().metrics.values() if isinstance(m, CostMetric)]
+    for a, b in permutations(log.streams.values(), 2):
+        if a.has_scale and not b.has_scale and any(m.accepts(a.kind, b.kind) for m in metrics):
+            return [a.name, b.name]
+    raise DataError(
+        f"{log.source} has no lidar and camera that an installed appearance metric compares (it has: {_kinds(log)}); "
+        "name two with --sensors"
+    )
 
 
 def rebased(truth: Calibration, names: Sequence[str], source: str) -> Calibration:
@@ -124,6 +152,10 @@ def rebased(truth: Calibration, names: Sequence[str], source: str) -> Calibratio
         undetermined=(),
         clock_skew=truth.clock_skew[rows] - truth.clock_skew[rows[0]],
     )
+
+
+def _kinds(log: Log) -> str:
+    return "; ".join(f"{s.name}, {s.kind}" for s in log.streams.values())
 
 
 def _base_first(log: Log) -> list[str]:

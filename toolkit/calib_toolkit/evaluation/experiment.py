@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import joblib
+import numpy as np
 
 from calib_toolkit import cache
 from calib_toolkit.config import METHODS, Config
@@ -15,25 +16,32 @@ from calib_toolkit.evaluation import baselines
 from calib_toolkit.evaluation.drives import Drive
 from calib_toolkit.evaluation.errors import FAILURES, UNITS, Finding, refusal
 from calib_toolkit.evaluation.protocols import Protocol, protocol
-from calib_toolkit.evaluation.sections import Draw, Section, cut, plan, side_by_side
+from calib_toolkit.evaluation.sections import Draw, Section, cut, fitting, plan, side_by_side, with_sight
 from calib_toolkit.evaluation.store import Row, Store
 from calib_toolkit.progress import Progress
 from calib_toolkit.types import Calibration
 
 DRAW = ("drive", "seconds", "spread", "repeat")
 FINDING = ("estimator", "sensor")
+NEEDS = {
+    "clocks": ([6], "how late the clock is"),
+    "rotations": ([3], "how it is turned"),
+    "poses": ([*range(6)], "where the sensor is and how it is turned"),
+}
+"""What an experiment can not do without: columns of ``determined``, and words."""
 
 
 @dataclass(frozen=True)
 class Choices:
     """repeats: sections of each length. seconds: the lengths. methods: the toolkit's own that are compared.
-    baseline: whether others run beside.
+    baseline: whether others run beside. wider: times the motion's sigma that starts are drawn with.
     """
 
     repeats: int
     seconds: tuple[float, ...]
     methods: tuple[str, ...] = METHODS
     baseline: bool = False
+    wider: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -57,12 +65,14 @@ def run(
     """
     experiment = protocol(name)
     check(experiment, {d.name: d.truth for d in drives})
-    draws, skipped = plan(drives, choices.seconds, experiment.spreads, choices.repeats)
+    lengths, said = fitting(drives, choices.seconds) if experiment.sees else (choices.seconds, [])
+    draws, skipped = plan(drives, lengths, experiment.spreads, choices.repeats)
+    skipped = said + skipped
     if not draws:
         raise DataError(
             f"no recording lasts long enough: {'; '.join(skipped)}; choose shorter lengths with --seconds"
         )
-    estimators = experiment.estimators(choices.methods, choices.baseline)
+    estimators = experiment.estimators(choices.methods, choices.baseline, config.appearance)
     labels = experiment.labels(tuple(drives[0].motions))
     configs = tuple(replace(config, method=m) for m in choices.methods)
     work = _Work(name, configs, tuple(experiment.baselines(choices.baseline)), tuple(estimators), tuple(labels))
@@ -73,7 +83,7 @@ def run(
     left = [d for d in draws if _key(d, drives) not in done]
     progress.begin(name, len(draws), len(done))
     pool = joblib.Parallel(n_jobs=config.jobs, return_as="generator_unordered", max_nbytes=None)
-    todo = (joblib.delayed(work)(d, cut(d, drives, name, config.seed), drives[d.drive].name) for d in left)
+    todo = (joblib.delayed(work)(d, _section(d, drives, name, choices, config), drives[d.drive].name) for d in left)
     for draw, rows in pool(todo):
         store.append(rows)
         done[_key(draw, drives)] = rows
@@ -96,19 +106,25 @@ def check(experiment: Protocol, truths: Mapping[str, Calibration]) -> None:
                 f"{name} has {', '.join(truth.names)} where {first} has {', '.join(told.names)}; "
                 "drives of one experiment have the same sensors: choose them with --sensors"
             )
-        clocks = experiment.needs == "clocks"
-        known = truth.determined[1:, 6 if clocks else 3]
+        needed, words = NEEDS[experiment.needs]
+        known = np.asarray(truth.determined[1:, needed].all(axis=1))
         # sensors whose clock nobody knows may run along; a rotation is what the others are told against
-        if not (known.any() if clocks else known.all()):
+        if not (known.any() if experiment.needs == "clocks" else known.all()):
             unknown = ", ".join(n for n, k in zip(truth.names[1:], known, strict=True) if not k)
             raise DataError(
-                f"the truth of {name} does not say {'how late the clock is' if clocks else 'how it is turned'} of "
+                f"the truth of {name} does not say {words} of "
                 f"{unknown} against {truth.base}; leave it out with --sensors, or give another truth with --truth"
             )
 
 
 def notes(name: str, choices: Choices) -> list[str]:
-    """Sentences on what this installation can not do."""
+    """Sentences on how it was done that the table does not tell, and on what this installation can not do."""
+    if name == "appearance":
+        return [
+            "every start is the truth moved by a draw from the motion's covariance"
+            f"{f', its sigmas {choices.wider:g} times as large' if choices.wider != 1 else ''}, since one part of a "
+            "drive always ends in the same motion result; the search is told that covariance"
+        ]
     if name == "pair" and choices.baseline and not baselines.opencv_has_hand_eye():
         return ["OpenCV's hand-eye calibration is left out: this OpenCV has no calibrateHandEye (4.x has)"]
     return []
@@ -140,6 +156,11 @@ class _Work:
         drawn = (drive, f"{draw.seconds:g}", f"{draw.spread:g}", str(draw.repeat), f"{section.start:.3f}")
         start = dict(zip((*DRAW, "start"), drawn, strict=True))
         return draw, [start | _row(f, columns(experiment)) for f in findings]
+
+
+def _section(d: Draw, drives: Sequence[Drive], name: str, choices: Choices, config: Config) -> Section:
+    section = cut(d, drives, name, config.seed)
+    return with_sight(section, d, drives[d.drive], choices.wider) if protocol(name).sees else section
 
 
 def _row(f: Finding, titles: Sequence[str]) -> dict[str, str]:
@@ -192,6 +213,7 @@ def _settings(
         "seed": config.seed,
         "methods": list(choices.methods),
         "estimators": list(estimators),
+        **({"wider": choices.wider} if protocol(name).sees else {}),
         "options": options,
         "version": ours,
     }

@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_toolkit.config import METHODS
+from calib_toolkit.evaluation import seen
 from calib_toolkit.evaluation.baselines import LEAST_SQUARES, OPENCV_METHODS
 from calib_toolkit.evaluation.errors import EULER, POSITION, UNITS
 from calib_toolkit.evaluation.measures import SEPARATE, TOGETHER
+from calib_toolkit.evaluation.seen import box
 from calib_toolkit.evaluation.store import Row
 from calib_toolkit.evaluation.summary import Statistics, Trial, groups, statistics, told_by_all, trial
 
@@ -60,7 +62,7 @@ def _timing(figure: Any, rows: Sequence[Row]) -> list[Any]:
         for at, seconds, method, some in groups(rows):
             if at == spread:
                 place = lengths.index(seconds) + (methods.index(method) - (len(methods) - 1) / 2) * room
-                _box(panel, statistics(some, "dt", compared).error, place, 0.8 * room, STYLES[method][1])
+                box(panel, statistics(some, "dt", compared).error, place, 0.8 * room, STYLES[method][1])
         panel.set_xticks(range(len(lengths)), [f"{s:g}" for s in lengths])
         panel.set_xlim(-0.6, len(lengths) - 0.4)
         panel.set_yscale("log")
@@ -116,7 +118,7 @@ def _panoramic(figure: Any, rows: Sequence[Row]) -> list[Any]:
         labels = []
         for place, estimator in enumerate(estimators):
             error = _by_repeat([r for r in rows if r["estimator"] == estimator], parameter, compared)
-            _box(panel, error, place, 0.6, STYLES[_method(estimator)][1])
+            box(panel, error, place, 0.6, STYLES[_method(estimator)][1])
             way = next((short for ending, short in ENDINGS.items() if estimator.endswith(ending)), "LS")
             labels.append(f"{way}\n{len(error)}/{repeats}")
         panel.set_xticks(range(len(estimators)), labels, fontsize=7.5)
@@ -128,7 +130,13 @@ def _panoramic(figure: Any, rows: Sequence[Row]) -> list[Any]:
     return [*(_frame(m) for m in dict.fromkeys(map(_method, estimators))), ways]
 
 
-DRAWN: dict[str, Drawing] = {"timing": _timing, "pair": _pair, "panoramic": _panoramic}
+DRAWN: dict[str, Drawing] = {
+    "timing": _timing,
+    "pair": _pair,
+    "panoramic": _panoramic,
+    "appearance": seen.appearance,
+    "full": seen.full,
+}
 
 
 def _method(estimator: str) -> str:
@@ -149,22 +157,6 @@ def _marker(method: str) -> Any:
 
     marker, color = STYLES[method]
     return Line2D([], [], marker=marker, color=color, ls="", fillstyle="none", label=method)
-
-
-def _box(panel: Any, values: Array, place: float, width: float, color: str) -> None:
-    if not len(values):
-        return
-    panel.boxplot(
-        [values],
-        positions=[place],
-        widths=width,
-        manage_ticks=False,
-        flierprops={"marker": "+", "markeredgecolor": color, "markersize": 4},
-        medianprops={"color": color, "linewidth": 2},
-        boxprops={"color": color},
-        capprops={"color": color},
-        whiskerprops={"color": color, "linestyle": "--"},
-    )
 
 
 def _band(panel: Any, line: Line, color: str) -> None:

@@ -130,20 +130,24 @@ def _found_times(method: str, c: Calibration, truth: Calibration) -> list[Findin
 
 def _found_pair(part: Part, label: str, truth: Calibration) -> Finding:
     method, c = part.config.method, part.calibration
-    if c is None:
-        return Finding(method, label, refused=part.refused)
-    known = c.determined[1]
+    return Finding(method, label, refused=part.refused) if c is None else found_pose(method, label, c, 1, truth)
+
+
+def found_pose(estimator: str, label: str, c: Calibration, i: int, truth: Calibration) -> Finding:
+    """Where a calibration puts its sensor i, against the truth of the same sensors."""
+    known = c.determined[i]
     unknown = {k for k, yes in zip((*POSITION, *DELTA, "dt"), known, strict=True) if not yes}
     unknown |= {e for e, d in zip(EULER, DELTA, strict=True) if d in unknown}
     unknown |= {"rotation"} if not known[3:6].all() else set()
     unknown |= {"translation"} if not known[:3].all() else set()
-    error = _rotation(c.T_base_sensor[1], truth.T_base_sensor[1]) | _position(c.T_base_sensor[1], truth, 1)
-    if truth.determined[1, 6]:
-        error["dt"] = _dt(c, 1, truth)
-    sigma = rotation_sigma(c.covariance[10:13, 10:13])
-    sigma |= dict(zip((*POSITION, "dt"), np.sqrt(np.diag(c.covariance)[[7, 8, 9, 13]]) * [1, 1, 1, 1e3], strict=True))
+    error = _rotation(c.T_base_sensor[i], truth.T_base_sensor[i]) | _position(c.T_base_sensor[i], truth, i)
+    if truth.determined[i, 6]:
+        error["dt"] = _dt(c, i, truth)
+    cov = c.covariance[7 * i : 7 * i + 7, 7 * i : 7 * i + 7]
+    sigma = rotation_sigma(cov[3:6, 3:6])
+    sigma |= dict(zip((*POSITION, "dt"), np.sqrt(np.diag(cov)[[0, 1, 2, 6]]) * [1, 1, 1, 1e3], strict=True))
     return Finding(
-        method,
+        estimator,
         label,
         {k: e for k, e in error.items() if k not in unknown},
         {k: s for k, s in sigma.items() if k not in unknown},

@@ -7,13 +7,10 @@ from typing import Literal
 
 from calib_toolkit.config import Config
 from calib_toolkit.errors import ConfigError, DataError
-from calib_toolkit.evaluation import baselines, drives, measures
+from calib_toolkit.evaluation import baselines, drives, measures, sights
 from calib_toolkit.evaluation.errors import EULER, POSITION, Finding
 from calib_toolkit.evaluation.sections import Section
 from calib_toolkit.types import Log
-
-AFTER_METRICS = {"appearance": "Fig. 10 and Table I", "full": "Fig. 12 and Table II"}
-"""Experiments that need the images and scans themselves, and where the paper shows them."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +22,7 @@ class Protocol:
     choose: the sensors of a recording that are compared. ways: in which each method is used, as its name's ending.
     baselines: what runs beside them, by whether more than the paper has is wanted. labels: what is told of one
     estimator, by the sensors' names. measure: all rows of one repeat, by the methods' configurations and baselines.
+    sees: whether it looks at scans and images. by_metric: whether metrics are compared, and not methods.
     """
 
     title: str
@@ -32,25 +30,25 @@ class Protocol:
     spreads: tuple[float, ...]
     parameters: tuple[str, ...]
     short: tuple[str, ...]
-    needs: Literal["clocks", "rotations"]
+    needs: Literal["clocks", "rotations", "poses"]
     choose: Callable[[Log], list[str]]
     ways: tuple[str, ...]
     baselines: Callable[[bool], list[str]]
     labels: Callable[[tuple[str, ...]], list[str]]
     measure: Callable[[Section, Sequence[Config], Sequence[str]], list[Finding]]
+    sees: bool = False
+    by_metric: bool = False
 
-    def estimators(self, methods: Sequence[str], baseline: bool) -> list[str]:
+    def estimators(self, methods: Sequence[str], baseline: bool, metrics: Sequence[str] = ()) -> list[str]:
         """All that are told apart, in the order of the rows. Raises ConfigError for what does not go together."""
+        if self.by_metric:
+            self.baselines(baseline)
+            return [sights.INITIAL, *(f"{metric}{way}" for metric in metrics for way in self.ways)]
         return [*(f"{method}{way}" for method in methods for way in self.ways), *self.baselines(baseline)]
 
 
 def protocol(name: str) -> Protocol:
-    """The experiment of that name. Raises ConfigError for one whose metrics nothing installed brings."""
-    if name in AFTER_METRICS:
-        raise ConfigError(
-            f"'{name}' ({AFTER_METRICS[name]} of the paper) compares what the sensors see, which takes appearance "
-            f"metrics, and no installed plugin brings one; run one of: {', '.join(PROTOCOLS)}"
-        )
+    """The experiment of that name."""
     return PROTOCOLS[name]
 
 
@@ -64,6 +62,14 @@ def _only_pair(names: tuple[str, ...]) -> list[str]:
     return ["-".join(names)]
 
 
+def _lidar_camera(names: tuple[str, ...]) -> list[str]:
+    if len(names) != 2:
+        raise DataError(
+            f"'appearance' compares a lidar and a camera, and these are {', '.join(names)}; name two with --sensors"
+        )
+    return ["-".join(names)]
+
+
 def _all_pairs(names: tuple[str, ...]) -> list[str]:
     return [f"{a}-{b}" for a, b in combinations(names, 2)]
 
@@ -71,6 +77,12 @@ def _all_pairs(names: tuple[str, ...]) -> list[str]:
 def _none(baseline: bool) -> list[str]:
     if baseline:
         raise ConfigError("--baseline does not go with 'timing': hand-eye calibration finds no clock offsets")
+    return []
+
+
+def _not_seeing(baseline: bool) -> list[str]:
+    if baseline:
+        raise ConfigError("--baseline does not go with 'appearance' or 'full': hand-eye calibration sees nothing")
     return []
 
 
@@ -126,5 +138,34 @@ PROTOCOLS = {
         baselines=_least_squares,
         labels=_all_pairs,
         measure=measures.measure_panoramic,
+    ),
+    "appearance": Protocol(
+        "Appearance of a lidar and a camera (Fig. 10, Table I)",
+        seconds=(100.0,),
+        spreads=(0.0,),
+        parameters=("rotation", "translation", *EULER, *POSITION),
+        short=(),
+        needs="poses",
+        choose=drives.lidar_and_camera,
+        ways=sights.WAYS,
+        baselines=_not_seeing,
+        labels=_lidar_camera,
+        measure=sights.measure_appearance,
+        sees=True,
+        by_metric=True,
+    ),
+    "full": Protocol(
+        "All sensors by motion and appearance (Fig. 12, Table II)",
+        seconds=(100.0,),
+        spreads=(0.0,),
+        parameters=("rotation", "translation", *EULER, *POSITION, "dt"),
+        short=(),
+        needs="rotations",
+        choose=drives.everyone,
+        ways=(sights.MOTION, sights.COMBINED),
+        baselines=_not_seeing,
+        labels=_every_other,
+        measure=sights.measure_full,
+        sees=True,
     ),
 }

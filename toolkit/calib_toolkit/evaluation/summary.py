@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_toolkit.evaluation import shares
 from calib_toolkit.evaluation.errors import DELTA, EULER, UNITS
 from calib_toolkit.evaluation.experiment import Outcome
 from calib_toolkit.evaluation.paper import beside
@@ -111,6 +112,8 @@ def markdown(name: str, done: Outcome, notes: Sequence[str] = ()) -> str:
     rows = done.rows
     experiment = PROTOCOLS[name]
     parts = [f"# {experiment.title}", "", f"![{experiment.title}]({name}.png)", "", *_explained(done)]
+    for title, lines in shares.tables(name, rows):
+        parts += ["", f"## {title}", "", *map(_line, (lines[0], ["---"] * len(lines[0]), *lines[1:]))]
     for parameter in experiment.parameters:
         if lines := table(name, rows, parameter):
             rule = ["---"] * len(lines[0])
