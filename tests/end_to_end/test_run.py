@@ -407,3 +407,4 @@ def test_rejected_readings_and_turned_travel_are_noted():
 )
 def test_how_long_to_drive_is_noted_where_it_is_longer_than_was_driven(needs, words):
     assert said(driving={"cam0": needs}, seconds=60.0) == [f"drive like this, in all, {words}"]
+    assert said(driving={"cam0": needs}, seconds=60.0, pairs=[{"metric": "im"}]) == []

@@ -81,6 +81,8 @@ def notes(result: Result) -> list[str]:
             f"{result.calibration.base}'s if all have it; the rotation is taken from turns alone"
         )
     sentences += found.get("left_out", [])
+    if found.get("pairs"):  # how long motion alone would take says nothing where appearance helps
+        return sentences
     return [*sentences, *_longer(found.get("driving", {}), found.get("seconds", 0.0))]
 
 
