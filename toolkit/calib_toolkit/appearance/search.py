@@ -125,8 +125,8 @@ def _searched(metric: CostMetric, moments: Sequence[Any], frame: Frame, seed: in
         return None
     least = np.linalg.solve(frame.L, np.diag(PARABOLA))
     found = evidence(cost, z, least @ least.T, seed)
-    worse = (other_cost.mean() - least_cost.mean()) / np.hypot(_error(least_cost), _error(other_cost))
-    apart = (found.posterior - other) * (worse < CLEAR)  # one that fits clearly worse is not another answer
+    # one that fits clearly worse is not another answer
+    apart = (found.posterior - other) * (_worse(other_cost, least_cost) < CLEAR)
     return replace(found, cov=found.cov + np.outer(apart, apart) / 2, apart=float(np.linalg.norm(apart)))
 
 
@@ -147,9 +147,13 @@ def _end(metric: CostMetric, moments: Sequence[Any], frame: Frame, z: Array, see
     return value, z
 
 
-def _error(costs: Array) -> float:
-    """Standard error of the mean of costs (m,)."""
-    return float(costs.std(ddof=1) / np.sqrt(len(costs)) + 1e-12)
+def _worse(costs: Array, least: Array) -> float:
+    """Standard errors by which costs (m,) are above others, moment by moment where they are of the same ones."""
+    if len(costs) == len(least):
+        variance = np.var(costs - least, ddof=1) / len(costs)
+    else:
+        variance = np.var(costs, ddof=1) / len(costs) + np.var(least, ddof=1) / len(least)
+    return float((costs.mean() - least.mean()) / np.sqrt(variance + 1e-24))
 
 
 def focused(
