@@ -79,3 +79,10 @@ def squared(error: Array, cov: Array) -> float:
 
 def _ends(poses: Array) -> tuple[Array, Array]:
     return poses[:-1], poses[1:]
+
+
+def bowl(T, best, off, shape):
+    """(k,) costs of poses (k, 4, 4) around one that is ``off`` (6,) from the best; ``shape`` (6,): how steep."""
+    turn = se3.log_so3(T[:, :3, :3] @ best[:3, :3].T)
+    error = np.column_stack([T[:, :3, 3] - best[:3, 3], turn])
+    return np.sum(((error - off) * shape) ** 2, axis=1)

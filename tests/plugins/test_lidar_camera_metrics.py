@@ -192,7 +192,7 @@ def test_nmi_takes_any_sensible_number_of_bins() -> None:
         assert metric.cost(TRUE, moment) < metric.costs(off(0.03 * np.eye(6)), moment).min()
     for bad in (1, 1000, 2.5):
         with pytest.raises(ConfigError, match=r"nmi: bins"):
-            NmiOptions(bad)  # type: ignore[arg-type]
+            NmiOptions(bad)
 
 
 def test_gom_is_the_agreement_of_angles_in_the_image() -> None:

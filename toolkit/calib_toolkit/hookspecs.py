@@ -109,6 +109,7 @@ class CostMetric(ABC):
         """
         return moment
 
+    # to override at will, so not abstract
     def draw(self, pair: Pair, poses: Mapping[str, NDArray[np.float64]], folder: Path) -> None:  # noqa: B027
         """Pictures in a folder by which a person can judge poses (4, 4), by name; nothing unless overridden."""
 

@@ -176,6 +176,7 @@ def _features(camera: Stream, k: int, options: MatchingOptions, R: Array) -> tup
 
     image, lens = np.asarray(camera.readings[k]), _lens(camera)
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    # OpenCV's stubs lack SIFT
     sift = cv2.SIFT_create(options.features, enable_precise_upscale=True)  # type: ignore[attr-defined]
     keys, histograms = sift.detectAndCompute(np.ascontiguousarray(grey), lens.mask)
     if not len(keys):

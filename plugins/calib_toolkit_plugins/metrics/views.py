@@ -4,6 +4,7 @@ A moment is one scan and one image, or two that follow each other. Points are mo
 the lidar was when each image was taken (paper, section VII-A); images are freed of distortion.
 """
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -125,9 +126,9 @@ class LidarCamera(CostMetric):
         """Which of the chosen points (m,) of a scan to compare, and what the lidar tells of each, (m, ...)."""
         return np.ones(len(chosen), dtype=bool), {}
 
+    @abstractmethod
     def pictures(self, image: Image, blur: float) -> tuple[Image, ...]:
         """What is looked up at the points; blur: in widths of the finest."""
-        raise NotImplementedError
 
     def worth(self, moment: Moment, uv: Array, reach: Array) -> NDArray[np.bool_]:
         """Which points (n,) there is something to compare at. uv: (j, 2, n) and reach: (n,) pixels around it."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 COLUMNS = ("x\ncm", "y\ncm", "z\ncm", "about x\ndeg", "about y\ndeg", "about z\ndeg")
-DIGITS = (1, 1, 1, 2, 2, 2)
+DIGITS = (1,) * 3 + (2,) * 3
 
 
 @click.command()
@@ -68,9 +68,10 @@ def check(
         raise DataError(f"{out} can not be written, for its folder does not exist; choose another file with --json")
     installed = registry(plugins)
     config = read_config(config_file) if config_file else Config()
-    brought = [e.id for e in installed.entries if (e.kind, e.distribution) == ("metric", FILE)]
-    given["appearance"] = (*config.appearance, *brought)
-    config = replace(config, **{k: v for k, v in given.items() if v is not None})  # type: ignore[arg-type]
+    own = [e.id for e in installed.entries if (e.kind, e.distribution) == ("metric", FILE)]
+    given["appearance"] = (*config.appearance, *own)
+    given = {k: v for k, v in given.items() if v is not None}
+    config = replace(config, **given)  # type: ignore[arg-type]  # click has seen to the types
     read = read_calibration(calibration)
     log = open_log(drive, format_id, installed)
     named, notes = _common(log, read, calibration)
@@ -294,7 +295,5 @@ def _numbers(look: "Look") -> dict[str, Any]:
 
 def _by_axis(values: Any) -> dict[str, Any]:
     """Of an array (6,) or (s, 6) plain values, None where there is none."""
-    import numpy as np
-
-    plain: Any = np.where(np.isnan(values.T), None, values.T)
-    return dict(zip(AXES, plain.tolist(), strict=True))
+    plain = [[v if v == v else None for v in row] for row in values.T.reshape(len(AXES), -1).tolist()]
+    return dict(zip(AXES, plain if values.ndim > 1 else [v for (v,) in plain], strict=True))
