@@ -1,7 +1,8 @@
 """Recordings as folders that ``calib-toolkit evaluate`` takes: ``python docs/results/recordings.py RECORDINGS DST``.
 
-RECORDINGS holds multi-array-calib/ and kitti-drive-0027/ (CONTRIBUTING.md). DST gets kitti/, kitti-ins/, shrimp/ and
-ladybug/, each a rig.toml that points into RECORDINGS and a truth.json; nothing is copied.
+RECORDINGS holds multi-array-calib/ and kitti-drive-0027/ (CONTRIBUTING.md). DST gets kitti/, kitti-ins/, kitti-kiss/ (the
+velodyne's motion from scan to map instead of scan to scan), shrimp/ and ladybug/, each a rig.toml that points into
+RECORDINGS and a truth.json; nothing is copied.
 """
 
 import json
@@ -24,7 +25,7 @@ KITTI_CAMERAS = {"cam0": 0.0, "cam1": 0.0, "cam2": 6.14e-3, "cam3": 6.70e-3}
 
 
 def write_all(recordings: Path, out: Path) -> None:
-    """Write all four folders."""
+    """Write all folders."""
     stored = recordings / "multi-array-calib"
     told = json.loads((stored / "ground_truth.json").read_text())
     pose = {name: se3.matrix(vec) for name, vec in told["kitti_2011_10_03"].items()}
@@ -35,10 +36,11 @@ def write_all(recordings: Path, out: Path) -> None:
     kitti["velo"] = (cam0_velo, None)
     write(out / "kitti", _logged(stored / "kitti", ["velo", *KITTI_CAMERAS]), kitti)
 
-    poses = recordings / "kitti-drive-0027" / "ins_pose_tum.txt"
-    ins = f'[sensors.ins]\nkind = "odometry"\nposes = "{poses}"\nformat = "tum"\n'
+    ins = _poses("ins", recordings / "kitti-drive-0027" / "ins_pose_tum.txt")
     with_ins = {**kitti, "ins": (cam0_velo @ pose["velNav"], None)}
     write(out / "kitti-ins", [*_logged(stored / "kitti", ["velo", *KITTI_CAMERAS]), ins], with_ins)
+    kiss = _poses("velo", recordings / "kitti-drive-0027" / "lidar_kissicp_pose_tum.txt")
+    write(out / "kitti-kiss", [kiss, ins], {name: with_ins[name] for name in ("velo", "ins")})
 
     shrimp = {"velo": (np.eye(4), 0.0), "ins": (se3.matrix(told["shrimp_velNav"]), None)}
     write(out / "shrimp", _logged(stored / "shrimp", list(shrimp)), shrimp)
@@ -57,6 +59,10 @@ def write(folder: Path, tables: Sequence[str], truth: Truth) -> None:
         name: {"T_base_sensor": T.tolist(), "dt_base_sensor": dt} for name, (T, dt) in truth.items()
     }
     (folder / "truth.json").write_text(json.dumps({"base": next(iter(truth)), "sensors": sensors}, indent=1) + "\n")
+
+
+def _poses(name: str, file: Path) -> str:
+    return f'[sensors.{name}]\nkind = "odometry"\nposes = "{file}"\nformat = "tum"\n'
 
 
 def _logged(log: Path, names: Sequence[str]) -> list[str]:

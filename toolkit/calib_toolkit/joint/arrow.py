@@ -4,18 +4,18 @@ The normal equations look like an arrow: a band for the latents, a narrow border
 latents are put together until the band is block-tridiagonal; cost and memory grow with the length of the drive.
 """
 
+import math
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.blas import dtrsm
+from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.linalg.lapack import dtbtrs
+from scipy.sparse import csc_array
 
 from calib_toolkit.joint.windows import Index, Windows
 
 Array = NDArray[np.float64]
-
-CHUNK = 4096
-"""Readings whose latents are looked up at once."""
 
 
 class Arrow:
@@ -41,11 +41,10 @@ class Arrow:
         """Readings with residuals (n, d) of weight (n, d, d), which change by by_latent (n, d, width)."""
         JW = np.swapaxes(by_latent, 1, 2) @ weight
         hessian, pull = JW @ by_latent, (JW @ residual[..., None])[..., 0]
-        w = windows.weights
-        for j in range(w.shape[1]):
-            _scatter(self._pull, windows.first + j, w[:, j, None] * pull)
-            for k in range(j + 1):
-                _scatter(self._band[:, j - k], windows.first + k, (w[:, j] * w[:, k])[:, None, None] * hessian)
+        w, m = windows.weights, windows.weights.shape[1]
+        self._pull += _summed(w, windows.first, pull, len(self._pull))
+        for j in range(m):
+            self._band[:, j] += _summed(w[:, j:] * w[:, : m - j], windows.first, hessian, len(self._band))
 
     def add_parameters(
         self, columns: Index, by_parameter: Array, windows: Windows, by_latent: Array, weight: Array, residual: Array
@@ -55,10 +54,7 @@ class Arrow:
         self.information[np.ix_(columns, columns)] += np.einsum("nqd,ndr->qr", LW, by_parameter)
         self.gradient[columns] += np.einsum("nqd,nd->q", LW, residual)
         cross = np.swapaxes(LW @ by_latent, 1, 2)
-        summed = np.zeros((*self._pull.shape, len(columns)))
-        for j in range(windows.weights.shape[1]):
-            _scatter(summed, windows.first + j, windows.weights[:, j, None, None] * cross)
-        self._cross[:, :, columns] += summed
+        self._cross[:, :, columns] += _summed(windows.weights, windows.first, cross, len(self._cross))
 
     def add_prior(self, stencil: Array, latents: Array, precision: Array) -> None:
         """A difference of neighbouring latents is about zero. stencil: (s,). precision: (width, width)."""
@@ -87,7 +83,7 @@ class Solved:
 
     def __init__(self, arrow: Arrow) -> None:
         self._size, self._width, self._per = arrow.size, arrow.width, arrow._per
-        self._factors = _factorise(*_blocks(arrow._band, arrow._per))
+        self._factor = cholesky_banded(_lower(arrow._band), overwrite_ab=True, lower=True, check_finite=False)
         found = self._solve(np.concatenate([arrow._pull[:, :, None], arrow._cross], axis=2))
         self._alone, self.response = found[: self._size, :, 0], found[: self._size, :, 1:]
         cross = arrow._cross[: self._size]
@@ -105,12 +101,9 @@ class Solved:
 
     def sample(self, rng: np.random.Generator) -> Array:
         """(size, width) one draw of the latents' error, parameters given."""
-        L, C = self._factors
-        left = rng.normal(size=(len(L), L.shape[1], 1))
-        for k in range(len(L) - 1, -1, -1):
-            behind = left[k] if k == len(C) else left[k] - C[k].T @ left[k + 1]
-            left[k] = _backward(L[k], behind)
-        return left.reshape(-1, self._width)[: self._size]
+        left = rng.normal(size=self._factor.shape[1])
+        found, _ = dtbtrs(self._factor, left, uplo="L", trans="T")
+        return np.asarray(found).reshape(-1, self._width)[: self._size]
 
     def covariance(self, windows: Windows, left: Array | None = None) -> Array:
         """(n, width, width) of what the readings see of the latents, parameters given.
@@ -120,84 +113,63 @@ class Solved:
         right, d = windows.weights, self._width
         left = right if left is None else left
         n, m = right.shape
-        left, right = ((w[:, :, None, None] * np.eye(d)).reshape(n, m * d, d) for w in (left, right))
         out = np.empty((n, d, d))
-        for part in (slice(k, k + CHUNK) for k in range(0, n, CHUNK)):
-            block, place = np.divmod(windows.first[part], self._per)
-            at = (place * d)[:, None] + np.arange(m * d)
-            near = self._inverse[block[:, None, None], at[:, :, None], at[:, None, :]]
-            out[part] = np.swapaxes(left[part], 1, 2) @ (near @ right[part])
+        block, place = np.divmod(windows.first, self._per)
+        for p in range(self._per):
+            own, of = np.flatnonzero(place == p), slice(p * d, (p + m) * d)
+            near = self._inverse[block[own], of, of].reshape(-1, m, d * m * d)
+            half = (left[own, None, :] @ near).reshape(-1, d, m, d)
+            out[own] = np.einsum("nimj,nm->nij", half, right[own])
         return out
 
     @cached_property
     def _inverse(self) -> Array:
         """(n, 2b, 2b) of the band's inverse, each block of latents with the next one (Takahashi's recursion)."""
-        L, C = self._factors
+        L, C = _blocks(self._factor, self._per * self._width)
         n, b, _ = L.shape
-        found, eye = np.zeros((n, 2 * b, 2 * b)), np.eye(b)
-        for k in range(n - 1, -1, -1):
-            inner = _forward(L[k], eye)
-            own = inner.T @ inner
-            if k < n - 1:
-                through = C[k] @ inner
-                later = found[k + 1, :b, :b]
-                below = -later @ through
-                own -= through.T @ below
-                found[k, b:, b:], found[k, b:, :b], found[k, :b, b:] = later, below, below.T
-            found[k, :b, :b] = own
+        inner = np.linalg.inv(L)
+        own, through = np.swapaxes(inner, 1, 2) @ inner, C @ inner[:-1]
+        found = np.zeros((n, 2 * b, 2 * b))
+        later = found[-1, :b, :b] = own[-1]
+        for k in range(n - 2, -1, -1):
+            below = -later @ through[k]
+            found[k, b:, b:], found[k, b:, :b] = later, below
+            later = found[k, :b, :b] = own[k] - through[k].T @ below
+        found[:-1, :b, b:] = np.swapaxes(found[:-1, b:, :b], 1, 2)
         return found
 
     def _solve(self, rhs: Array) -> Array:
         """The band's system for (padded, width, q) right-hand sides."""
-        L, C = self._factors
-        y = rhs.reshape(len(L), L.shape[1], -1).copy()
-        for k in range(len(L)):
-            y[k] = _forward(L[k], y[k] - C[k - 1] @ y[k - 1] if k else y[k])
-        for k in range(len(L) - 1, -1, -1):
-            y[k] = _backward(L[k], y[k] - C[k].T @ y[k + 1] if k < len(C) else y[k])
-        return y.reshape(rhs.shape)
+        flat = rhs.reshape(self._factor.shape[1], rhs.shape[2])
+        return np.asarray(cho_solve_banded((self._factor, True), flat, check_finite=False)).reshape(rhs.shape)
 
 
-def _forward(L: Array, rhs: Array) -> Array:
-    """``L x = rhs``, without what a checked call costs: it is made once for each block."""
-    return np.asarray(dtrsm(1.0, L.T, rhs.T, side=1, lower=0).T)
+def _summed(weights: Array, first: Index, values: Array, size: int) -> Array:
+    """(size, ...) sums of values (n, ...), each by its weights (n, m) for m neighbours from the first (n,) on."""
+    n, m = weights.shape
+    latents = (first[:, None] + np.arange(m)).ravel()
+    matrix = csc_array((weights.ravel(), latents, np.arange(0, n * m + 1, m)), shape=(size, n))
+    return np.asarray(matrix @ values.reshape(n, math.prod(values.shape[1:]))).reshape(size, *values.shape[1:])
 
 
-def _backward(L: Array, rhs: Array) -> Array:
-    """``L^T x = rhs``."""
-    return np.asarray(dtrsm(1.0, L.T, rhs.T, side=1, lower=0, trans_a=1).T)
-
-
-def _scatter(into: Array, index: Index, values: Array) -> None:
-    """``into[index] += values`` for an index that does not decrease."""
-    if len(index):
-        starts = np.concatenate([[0], np.flatnonzero(np.diff(index)) + 1])
-        into[index[starts]] += np.add.reduceat(values, starts, axis=0)
-
-
-def _blocks(band: Array, per: int) -> tuple[Array, Array]:
-    """Diagonal blocks (n, b, b) and those below them (n - 1, b, b) of a band (size, reach, d, d)."""
+def _lower(band: Array) -> Array:
+    """(reach * d, size * d) lower form of a band (size, reach, d, d), as LAPACK has it."""
     size, reach, d, _ = band.shape
-    n = size // per
-    diagonal, below = np.zeros((n, per * d, per * d)), np.zeros((n - 1, per * d, per * d))
-    of = band.reshape(n, per, reach, d, d)
-    for k in range(per):
-        for j in range(reach):
-            row, column = (slice(i % per * d, (i % per + 1) * d) for i in (k + j, k))
-            if k + j < per:
-                diagonal[:, row, column] = of[:, k, j]
-                diagonal[:, column, row] = np.swapaxes(of[:, k, j], 1, 2)
-            else:
-                below[:, row, column] = of[:-1, k, j]
-    return diagonal, below
+    out = np.zeros((reach * d, size, d))
+    for row in range(d):
+        for column in range(d):
+            of = slice(0 if row >= column else 1, reach)  # above the diagonal there is its mirror image
+            out[of.start * d + row - column :: d, :, column][: reach - of.start] = band[:, of, row, column].T
+    return out.reshape(reach * d, -1)
 
 
-def _factorise(diagonal: Array, below: Array) -> tuple[Array, Array]:
-    """Cholesky factors: (n, b, b) on the diagonal and (n - 1, b, b) below it."""
-    L, C = np.empty_like(diagonal), np.empty_like(below)
-    for k in range(len(L)):
-        left = diagonal[k] - C[k - 1] @ C[k - 1].T if k else diagonal[k]
-        L[k] = np.linalg.cholesky(left)
-        if k < len(C):
-            C[k] = _forward(L[k], below[k].T).T
-    return L, C
+def _blocks(factor: Array, b: int) -> tuple[Array, Array]:
+    """Diagonal blocks (n, b, b) of a lower factor in LAPACK's form, and those below them (n - 1, b, b)."""
+    of, (row, column) = factor.reshape(len(factor), -1, b), np.indices((b, b))
+
+    def shifted(by: int) -> Array:
+        off = row - column + by
+        held = (off >= 0) & (off < len(of))
+        return np.where(held, np.moveaxis(of[np.where(held, off, 0), :, column], 2, 0), 0.0)
+
+    return shifted(0), shifted(b)[:-1]
