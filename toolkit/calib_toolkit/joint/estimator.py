@@ -11,7 +11,7 @@ from scipy.linalg import block_diag, null_space
 from calib_toolkit import assembly, checks, observability, se3, sync
 from calib_toolkit.config import Config
 from calib_toolkit.errors import NotObservableError
-from calib_toolkit.joint import moving, prior, report, spread, start, told, turning, verdict
+from calib_toolkit.joint import leaning, moving, prior, report, spread, start, told, turning, verdict
 from calib_toolkit.joint.clocks import Clocks
 from calib_toolkit.joint.readings import ready
 from calib_toolkit.progress import Progress
@@ -20,8 +20,6 @@ from calib_toolkit.types import Calibration, Measured, Motions, Result, Undeterm
 Array = NDArray[np.float64]
 
 STAGES = "clocks, poses"
-SURE = 5.0
-"""Sigma by which a sensor's turns and travel must disagree before its travel is not believed."""
 GATE = 100.0
 """Sigma by which two sensors' angles may differ on a step that is used before their noise is known."""
 
@@ -146,20 +144,21 @@ def _place(timed: Timed, known: Sequence[Measured]) -> Placed:
         prior=lambda T: prior.information(T, names, known),
     )
     found = search(T=T, free=_free(open_, [np.zeros((3, 0))] * len(open_)))
-    biased = _biased(timed, open_, found)
-    if any(axes.size for axes in biased):
-        found = search(T=found.T_base_sensor, free=_free(open_, biased))
+    leans = leaning.axes(timed.turned, open_, verdict.untold(_unscaled(timed.steps), timed.T), found)
+    if any(axes.size for axes in leans):
+        found = search(T=found.T_base_sensor, free=_free(open_, leans))
     cov, gain = spread.covariance(found.information, found.feigned, found.free)
-    cov = cov + _as_biased(timed, found, biased)
+    cov = cov + leaning.doubt(found, leans, np.sum(timed.steps.vec[0, :, :3], axis=0))
     stamps = [timed.clocks.base_time(i, m.start) for i, m in enumerate(timed.motions)]
     groups = np.split(np.arange(6 * (len(names) - 1)), len(names) - 1)
     wider = np.sqrt(spread.inflation(found.pulls, stamps, gain, cov, groups))
     cov = cov * np.outer(wider, wider)
+    T, by_found = leaning.between(found, leans)
     # a clock that is off by some time moves the poses with it
     poses, clock_cov = 6 * (len(names) - 1), timed.told.cov
-    cov, moved = cov[:poses, :poses], (-gain @ found.by_clock)[:poses]
+    cov, moved = (by_found @ cov @ by_found.T)[:poses, :poses], (-by_found @ gain @ found.by_clock)[:poses]
     joint = np.block([[cov + moved @ clock_cov @ moved.T, moved @ clock_cov], [clock_cov @ moved.T, clock_cov]])
-    return Placed(found.T_base_sensor, joint, _unknown(timed, open_, joint), found)
+    return Placed(T, joint, _unknown(timed, open_, joint), found)
 
 
 def _unknown(timed: Timed, open_: Sequence[Array], cov: Array) -> list[Undetermined]:
@@ -210,43 +209,6 @@ def _offsets(timed: Timed) -> Calibration:
     known = found.determined.copy()
     known[1:, 3:6] = False
     return replace(found, determined=known)
-
-
-def _biased(timed: Timed, open_: Sequence[Array], found: moving.Moving) -> list[Array]:
-    """For each sensor but the base, axes (3, j) about which its turns alone say something else than its travel too.
-
-    A travel that is turned against the turns is a fault of the sensor's own motion, and tells nothing of rotation.
-    """
-    axes = []
-    by_turns = verdict.untold(_unscaled(timed.steps), timed.T)
-    for k, (directions, unturned) in enumerate(zip(open_, by_turns, strict=True)):
-        R = found.T_base_sensor[k + 1, :3, :3], timed.turned.R_base_sensor[k + 1]
-        apart = se3.log_so3(R[1] @ R[0].T)
-        # what nothing told, or turns do not, may lie anywhere
-        anywhere = np.concatenate([verdict.turns(directions), verdict.turns(unturned)], axis=1)[3:]
-        told = null_space(anywhere.T) if anywhere.size else np.eye(3)
-        if not told.size:
-            axes.append(told)
-            continue
-        variance, vectors = np.linalg.eigh(told.T @ timed.turned.cov[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] @ told)
-        each = told @ vectors
-        axes.append(each[:, (each.T @ apart) ** 2 > SURE**2 * variance])
-    return axes
-
-
-def _as_biased(timed: Timed, found: moving.Moving, biased: Sequence[Array]) -> Array:
-    """(9(n-1), 9(n-1)) what a travel that is turned about one axis leaves open about the others that it tells.
-
-    It may well be turned as far about those, where the turns do not tell enough to show it.
-    """
-    cov = np.zeros((len(found.free), len(found.free)))
-    ahead = np.sum(timed.steps.vec[0, :, :3], axis=0)
-    for k, axes in enumerate(biased):
-        if axes.size:
-            others = null_space(np.column_stack([axes, ahead]).T)
-            at = slice(6 * k + 3, 6 * k + 6)
-            cov[at, at] = np.sum(found.bias[k + 1] ** 2) * others @ others.T
-    return cov
 
 
 def _free(open_: Sequence[Array], biased: Sequence[Array]) -> Array:

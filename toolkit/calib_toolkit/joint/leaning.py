@@ -1,0 +1,75 @@
+"""Sensors whose travel is turned against their own turns: which of the two to believe, and how far."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import null_space
+
+from calib_toolkit import se3
+from calib_toolkit.joint import verdict
+from calib_toolkit.joint.moving import Moving
+from calib_toolkit.joint.turning import Turning
+
+Array = NDArray[np.float64]
+
+SURE = 3.5
+"""Sigma by which a sensor's turns and travel must disagree before they are not believed together."""
+MOST = float(np.radians(1.5))
+"""Travel is never turned further than this: then it is the turns that are wrong."""
+USUAL = float(np.radians(0.5))
+"""Sigma of what travel is turned by, as far as recordings show, where the turns are no help to tell."""
+
+
+def axes(turned: Turning, open_: Sequence[Array], by_turns: Sequence[Array], found: Moving) -> list[Array]:
+    """For each sensor but the base, axes (3, j) about which its turns alone say something else than its travel too.
+
+    open_, by_turns: (6, k) directions of each pose that nothing tells, and that turns do not.
+    """
+    axes = []
+    for k, (directions, unturned) in enumerate(zip(open_, by_turns, strict=True)):
+        R = found.T_base_sensor[k + 1, :3, :3], turned.R_base_sensor[k + 1]
+        apart = se3.log_so3(R[1] @ R[0].T)
+        # what nothing told, or turns do not, may lie anywhere
+        anywhere = np.concatenate([verdict.turns(directions), verdict.turns(unturned)], axis=1)[3:]
+        told = null_space(anywhere.T) if anywhere.size else np.eye(3)
+        if not told.size:
+            axes.append(told)
+            continue
+        variance, vectors = np.linalg.eigh(told.T @ turned.cov[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] @ told)
+        each = told @ vectors
+        axes.append(each[:, (each.T @ apart) ** 2 > SURE**2 * variance])
+    return axes
+
+
+def between(found: Moving, axes: Sequence[Array]) -> tuple[Array, Array]:
+    """T_base_sensor (n, 4, 4), and (p, p) what their errors are of those that were found, p = 9(n-1).
+
+    The rotation that was found is that of the turns. Half-way to that of the travel no more than half the difference
+    is wrong, whichever is at fault; where they are too far apart, it is the turns.
+    """
+    T, by_found = found.T_base_sensor.copy(), np.eye(len(found.free))
+    n = len(T)
+    for k, bias in enumerate(found.bias[1:]):
+        if axes[k].size:
+            way = -bias if np.linalg.norm(bias) > MOST else -bias / 2
+            turn, by = slice(6 * k + 3, 6 * k + 6), 6 * (n - 1) + 3 * k
+            by_found[turn, turn] = se3.exp_so3(way)
+            by_found[turn, by : by + 3] = -np.linalg.norm(way) / np.linalg.norm(bias) * se3.left_jacobian(way)
+            T[k + 1, :3, :3] = by_found[turn, turn] @ T[k + 1, :3, :3]
+    return T, by_found
+
+
+def doubt(found: Moving, axes: Sequence[Array], ahead: Array) -> Array:
+    """(p, p) what such a contradiction leaves open, p = 9(n-1). ahead: (3,) where the base went.
+
+    About the axes that travel alone tells, it may well be turned as far.
+    """
+    cov = np.zeros((len(found.free), len(found.free)))
+    for k, about in enumerate(axes):
+        if about.size:
+            turn, size = slice(6 * k + 3, 6 * k + 6), float(np.linalg.norm(found.bias[k + 1]))
+            own, other = (USUAL, 0.0) if size > MOST else (size / 2, size)
+            others = null_space(np.column_stack([about, ahead]).T)
+            cov[turn, turn] = own**2 * about @ about.T + other**2 * others @ others.T
+    return cov
