@@ -148,7 +148,7 @@ def _place(timed: Timed, known: Sequence[Measured]) -> Placed:
     if any(axes.size for axes in leans):
         found = search(T=found.T_base_sensor, free=_free(open_, leans))
     cov, gain = spread.covariance(found.information, found.feigned, found.free)
-    cov = cov + leaning.doubt(found, leans, np.sum(timed.steps.vec[0, :, :3], axis=0))
+    cov = cov + leaning.doubt(timed.turned, found, leans, np.sum(timed.steps.vec[0, :, :3], axis=0))
     stamps = [timed.clocks.base_time(i, m.start) for i, m in enumerate(timed.motions)]
     groups = np.split(np.arange(6 * (len(names) - 1)), len(names) - 1)
     wider = np.sqrt(spread.inflation(found.pulls, stamps, gain, cov, groups))

@@ -60,16 +60,22 @@ def between(found: Moving, axes: Sequence[Array]) -> tuple[Array, Array]:
     return T, by_found
 
 
-def doubt(found: Moving, axes: Sequence[Array], ahead: Array) -> Array:
-    """(p, p) what such a contradiction leaves open, p = 9(n-1). ahead: (3,) where the base went.
+def doubt(turned: Turning, found: Moving, axes: Sequence[Array], ahead: Array) -> Array:
+    """(p, p) what such contradictions leave open, p = 9(n-1). ahead: (3,) where the base went.
 
-    About the axes that travel alone tells, it may well be turned as far.
+    About the other axis across travel it may well be turned as far, as long as turns would not show it. The base's
+    fault is shared by all sensors, so theirs count as one: what they differ by between each other stays known.
     """
-    cov = np.zeros((len(found.free), len(found.free)))
-    for k, about in enumerate(axes):
+    own, other = np.zeros((len(found.free), 4)), np.zeros((len(found.free), 3))
+    for k, (about, bias) in enumerate(zip(axes, found.bias[1:], strict=True)):
         if about.size:
-            turn, size = slice(6 * k + 3, 6 * k + 6), float(np.linalg.norm(found.bias[k + 1]))
-            own, other = (USUAL, 0.0) if size > MOST else (size / 2, size)
-            others = null_space(np.column_stack([about, ahead]).T)
-            cov[turn, turn] = own**2 * about @ about.T + other**2 * others @ others.T
-    return cov
+            turn, size = slice(6 * k + 3, 6 * k + 6), np.linalg.norm(bias)
+            if size > MOST:
+                own[turn, :3] = USUAL * about @ about.T
+                continue
+            across = null_space(np.array([bias, ahead]))
+            variance = across.T @ turned.cov[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] @ across
+            shown = SURE * np.sqrt(np.trace(variance))
+            own[turn, 3] = bias / 2
+            other[turn] = min(size, shown) * across @ across.T
+    return np.asarray(own @ own.T + other @ other.T)
