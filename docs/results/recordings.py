@@ -1,8 +1,8 @@
 """Recordings as folders that ``calib-toolkit evaluate`` takes: ``python docs/results/recordings.py RECORDINGS DST``.
 
-RECORDINGS holds multi-array-calib/ and kitti-drive-0027/ (CONTRIBUTING.md). DST gets kitti/, kitti-ins/, kitti-kiss/ (the
-velodyne's motion from scan to map instead of scan to scan), shrimp/ and ladybug/, each a rig.toml that points into
-RECORDINGS and a truth.json; nothing is copied.
+RECORDINGS holds multi-array-calib/ and kitti-drive-0027/ (CONTRIBUTING.md). DST gets kitti/, kitti-ins/, kitti-kiss/
+(the velodyne's motion from scan to map instead of scan to scan), shrimp/ and ladybug/, each a rig.toml that points
+into RECORDINGS and a truth.json; nothing is copied.
 """
 
 import json

@@ -78,8 +78,8 @@ def notes(result: Result) -> list[str]:
     if turned:
         sentences.append(
             f"travel is turned against turns: {', '.join(turned)}; a fault of that sensor's own motion, or of "
-            f"{result.calibration.base}'s if all have it; the rotation lies between the two and its sigma reaches both; "
-            "from 1.5 deg on, travel alone tells it"
+            f"{result.calibration.base}'s if all have it; the rotation lies between the two, and its sigma "
+            "reaches both; from 1.5 deg on, travel alone tells it"
         )
     sentences += found.get("left_out", [])
     if found.get("pairs"):  # how long motion alone would take says nothing where appearance helps
