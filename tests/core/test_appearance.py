@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from calib_toolkit import Config, CostMetric, Motions, Pair, Stream, Transform, poses_at, se3
 from calib_toolkit.appearance import pairs, refinement, search
 from calib_toolkit.appearance.evidence import evidence
-from calib_toolkit.errors import ConfigError
+from calib_toolkit.errors import ConfigError, DataError
 from calib_toolkit.plugins import Registry
 
 STEPS = 100
@@ -203,3 +203,56 @@ def test_unknown_metrics_are_refused():
         refinement.chosen(replace(Config(), appearance=("sift",)), Registry([]))
     assert refinement.chosen(replace(Config(), appearance=("none",)), Registry([])) == {}
     assert refinement.chosen(Config(), Registry([])) == {}
+
+
+class Counted(Bowl):
+    """Says how often it was asked for a moment."""
+
+    asked = 0
+
+    def prepare(self, pair, options):
+        Counted.asked += 1
+        return super().prepare(pair, options)
+
+
+def test_what_was_found_for_a_pair_is_kept(tmp_path):
+    """A killed run goes on where it stopped; another prior, seed or version is other work."""
+
+    def look(pair, seed=0, version="1"):
+        metric, Counted.asked = Counted(), 0
+        metric.version = version
+        found = refinement._estimate(pairs.Comparison(metric, pair), metric.options(), seed, tmp_path)
+        return found, Counted.asked
+
+    pair = pair_at(off(TRUE, SIGMA / 2))
+    first, asked = look(pair)
+    assert asked
+    again, asked = look(pair)
+    assert not asked
+    assert again.transform.has_scale is True
+    for a, b in ((first, again), (first.transform, again.transform)):
+        for name, value in vars(a).items():
+            if name != "transform":
+                assert np.array_equal(value, vars(b)[name]), name
+    (file,) = tmp_path.rglob("*.json")
+    file.write_text(file.read_text()[:100])
+    assert look(pair)[1]
+    assert look(pair, seed=1)[1]
+    assert look(pair, version="2")[1]
+    assert look(replace(pair, dt_a_b=0.01))[1]
+
+
+def test_a_pair_that_can_not_be_read_is_tried_again(tmp_path):
+    class Broken(Counted):
+        def prepare(self, pair, options):
+            super().prepare(pair, options)
+            raise DataError("a.png is cut off")
+
+    comparison = pairs.Comparison(Broken(), pair_at(TRUE))
+    for _ in range(2):
+        Counted.asked = 0
+        found = refinement._estimate(comparison, comparison.metric.options(), 0, tmp_path)
+        assert not found.converged
+        assert "cut off" in found.note
+        assert Counted.asked
+    assert not [*tmp_path.rglob("*.json")]

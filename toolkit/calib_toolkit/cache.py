@@ -1,18 +1,20 @@
-"""Motions that were estimated before, kept on disk under a hash of everything they came from."""
+"""Motions and pairs that were estimated before, kept on disk under a hash of everything they came from."""
 
+import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
 from types import FunctionType, MethodType
-from typing import Any
+from typing import IO, Any
 from zlib import crc32
 
 import joblib
 import numpy as np
 
-from calib_toolkit.types import LazyReadings, Motions, Trajectory
+from calib_toolkit.types import LazyReadings, Motions, PairEstimate, Trajectory, Transform
 
 FORMAT = 1
 """Raised when what is stored changes shape."""
@@ -46,19 +48,45 @@ def load(folder: Path, key: str) -> tuple[Motions | Trajectory, tuple[str, ...]]
 
 def store(folder: Path, key: str, motion: Motions | Trajectory, notes: Sequence[str]) -> None:
     """Keep a motion; whole or not at all, so that a kill leaves nothing half-written."""
-    file = _file(folder, key)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_suffix(f".{os.getpid()}.part")
     values = {f.name: np.asarray(getattr(motion, f.name)) for f in fields(motion)}
-    with part.open("wb") as f:
+    with _whole(_file(folder, key)) as f:
         np.savez(
             f, allow_pickle=False, kind=np.array(type(motion).__name__), notes=np.array(notes, dtype=str), **values
         )
+
+
+def load_pair(folder: Path, key: str) -> PairEstimate | None:
+    """What was stored of a pair under a key, or None; a damaged file counts as none."""
+    try:
+        stored = json.loads(_file(folder, key, "json").read_text())
+        pose: dict[str, Any] = {
+            k: np.array(v) if isinstance(v, list) else v for k, v in stored.pop("transform").items()
+        }
+        return PairEstimate(transform=Transform(**pose), by_clock=np.array(stored.pop("by_clock")), **stored)
+    except Exception:  # as for motions
+        return None
+
+
+def store_pair(folder: Path, key: str, estimate: PairEstimate) -> None:
+    """Keep what a metric found for a pair; whole or not at all."""
+    plain = {f.name: getattr(estimate, f.name) for f in fields(estimate)}
+    plain["transform"] = {f.name: getattr(estimate.transform, f.name) for f in fields(estimate.transform)}
+    with _whole(_file(folder, key, "json")) as f:
+        f.write(json.dumps(plain, default=lambda x: x.tolist()).encode())
+
+
+@contextmanager
+def _whole(file: Path) -> Iterator[IO[bytes]]:
+    """A file to write that is there once all of it is."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    part = file.with_suffix(f".{os.getpid()}.part")
+    with part.open("wb") as f:
+        yield f
     part.replace(file)
 
 
-def _file(folder: Path, key: str) -> Path:
-    return folder / key[:2] / f"{key}.npz"
+def _file(folder: Path, key: str, kind: str = "npz") -> Path:
+    return folder / key[:2] / f"{key}.{kind}"
 
 
 def _plain(value: Any) -> Any:

@@ -55,7 +55,10 @@ class Sensor:
 
 
 class Metric(Protocol):
-    """A measure of how well two sensors' appearance agrees. ``options`` is a frozen dataclass type."""
+    """A measure of how well two sensors' appearance agrees. ``options`` is a frozen dataclass type.
+
+    What it finds is kept in a cache. It may have a ``version``, to be raised when the answers change.
+    """
 
     id: str
     options: type
@@ -77,11 +80,12 @@ class CostMetric(ABC):
     """A metric that only says how bad a pose is at one moment; the core searches for the best over all of them.
 
     ``accepts`` and ``cost`` are enough. The others make it faster: what does not depend on the pose is done once in
-    ``prepare``, and ``costs`` may take many poses at a time.
+    ``prepare``, and ``costs`` may take many poses at a time. Raise ``version`` when the answers change.
     """
 
     id: str
     options: type = NoOptions
+    version: str = "1"
 
     @abstractmethod
     def accepts(self, kind_a: str, kind_b: str) -> bool:

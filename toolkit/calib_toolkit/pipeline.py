@@ -45,13 +45,14 @@ def calibrate(
     """
     config, plugins, progress = config or Config(), plugins or registry(), progress or Silent()
     log = log.trim(config.start, config.duration)
-    moved = sensor_motions(log, config, plugins, progress, cache_folder or cache.default_folder())
+    folder = cache_folder or cache.default_folder()
+    moved = sensor_motions(log, config, plugins, progress, folder)
     names = _base_first(moved, config.base)
     skipped = [*log.notes, *(note for n in names for note in (*log.streams[n].notes, *moved[n].notes))]
     clocks = [log.streams[n].clock for n in names]
     result = calibrate_motions({n: moved[n].motions for n in names}, config, clocks, skipped, progress)
     whole = {n: moved[n].motion for n in names}
-    return appearance.refine(result, log, whole, config, plugins, progress, pictures)
+    return appearance.refine(result, log, whole, config, plugins, progress, pictures, folder)
 
 
 def sensor_motions(

@@ -9,6 +9,7 @@ from typing import Any
 import joblib
 import numpy as np
 
+from calib_toolkit import cache
 from calib_toolkit.appearance.pairs import Comparison, Moved, comparisons
 from calib_toolkit.appearance.search import estimate
 from calib_toolkit.combine import Combined, combine, combine_paper
@@ -31,11 +32,12 @@ def refine(
     plugins: Registry,
     progress: Progress,
     pictures: Path | None = None,
+    folder: Path | None = None,
 ) -> Result:
     """The result with the appearance of every pair in it, each counted beside the motion.
 
-    motion: of each sensor, on its own stamps. pictures: folder for what a person can judge by. Raises ConfigError on
-    a metric that does not exist.
+    motion: of each sensor, on its own stamps. pictures: folder for what a person can judge by. folder: of the cache;
+    None keeps nothing. Raises ConfigError on a metric that does not exist.
     """
     metrics = chosen(config, plugins)
     if not metrics:
@@ -46,7 +48,7 @@ def refine(
     progress.begin(TASK, len(found))
     estimates = []
     pool = joblib.Parallel(n_jobs=min(config.jobs, len(found)), return_as="generator")
-    for e in pool(joblib.delayed(_estimate)(c, options(c.metric, config), config.seed) for c in found):
+    for e in pool(joblib.delayed(_estimate)(c, options(c.metric, config), config.seed, folder) for c in found):
         estimates.append(e)
         progress.advance(TASK, 1)
     combined = (combine_paper if config.method == "paper" else combine)(result.calibration, estimates)
@@ -134,13 +136,21 @@ def told(estimates: Sequence[PairEstimate], combined: Combined) -> list[dict[str
     ]
 
 
-def _estimate(comparison: Comparison, chosen: Any, seed: int) -> PairEstimate:
-    """One metric's look at one pair; what can not be read says so and is not used."""
+def _estimate(comparison: Comparison, chosen: Any, seed: int, folder: Path | None) -> PairEstimate:
+    """One metric's look at one pair: from the cache, or made and kept there. What can not be read says so."""
     metric, pair = comparison.metric, comparison.pair
+    key = ""
+    if folder is not None:
+        key = cache.key_of(metric.id, type(metric).__name__, getattr(metric, "version", "1"), chosen, seed, pair)
+        if (stored := cache.load_pair(folder, key)) is not None:
+            return stored
     try:
-        return estimate(metric, pair, chosen, seed)
+        found = estimate(metric, pair, chosen, seed)
     except CalibrationError as e:
         return PairEstimate(metric.id, pair.prior, converged=False, note=f"{comparison.name}: {e}")
+    if folder is not None:
+        cache.store_pair(folder, key, found)
+    return found
 
 
 def _draw(found: Sequence[Comparison], before: Calibration, after: Calibration, folder: Path) -> None:
