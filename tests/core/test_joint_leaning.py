@@ -1,6 +1,7 @@
 """A sensor whose travel is turned against its turns, and one whose turns are wrong."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -101,3 +102,15 @@ def test_a_fault_of_the_base_leaves_the_others_known_to_each_other(rough):
     c = calibrate_motions(motions, Config()).calibration
     assert np.degrees(c.sigma[1:, 4]).min() > 0.4
     assert np.degrees(np.sqrt(np.diag(c.between("ins", "ins1").cov)[3:6])).max() < 0.1
+
+
+def test_travel_is_never_turned_about_itself():
+    """That would change nothing, and an axis that has a part of it lets a small lean look like a large one."""
+    turn = se3.exp_so3(np.radians([0.3, 0.5, 0.0]))
+    there = found(np.zeros((1, 3)), n=2)
+    by_turns = SimpleNamespace(
+        R_base_sensor=turn @ there.T_base_sensor[:, :3, :3], cov=np.radians(0.1) ** 2 * np.eye(3)
+    )
+    nothing = [np.zeros((6, 0))]
+    (about,) = leaning.axes(by_turns, nothing, nothing, there, np.array([8.0, 0.0, 0.0]))
+    assert_allclose(np.abs(about.T), [[0.0, 1.0, 0.0]], atol=1e-9)

@@ -144,11 +144,12 @@ def _place(timed: Timed, known: Sequence[Measured]) -> Placed:
         prior=lambda T: prior.information(T, names, known),
     )
     found = search(T=T, free=_free(open_, [np.zeros((3, 0))] * len(open_)))
-    leans = leaning.axes(timed.turned, open_, verdict.untold(_unscaled(timed.steps), timed.T), found)
+    ahead = np.sum(timed.steps.vec[0, :, :3], axis=0)
+    leans = leaning.axes(timed.turned, open_, verdict.untold(_unscaled(timed.steps), timed.T), found, ahead)
     if any(axes.size for axes in leans):
         found = search(T=found.T_base_sensor, free=_free(open_, leans))
     cov, gain = spread.covariance(found.information, found.feigned, found.free)
-    cov = cov + leaning.doubt(timed.turned, found, leans, np.sum(timed.steps.vec[0, :, :3], axis=0))
+    cov = cov + leaning.doubt(timed.turned, found, leans, ahead)
     stamps = [timed.clocks.base_time(i, m.start) for i, m in enumerate(timed.motions)]
     groups = np.split(np.arange(6 * (len(names) - 1)), len(names) - 1)
     wider = np.sqrt(spread.inflation(found.pulls, stamps, gain, cov, groups))

@@ -21,10 +21,13 @@ USUAL = float(np.radians(0.5))
 """Sigma of what travel is turned by, as far as recordings show, where the turns are no help to tell."""
 
 
-def axes(turned: Turning, open_: Sequence[Array], by_turns: Sequence[Array], found: Moving) -> list[Array]:
+def axes(
+    turned: Turning, open_: Sequence[Array], by_turns: Sequence[Array], found: Moving, ahead: Array
+) -> list[Array]:
     """For each sensor but the base, axes (3, j) about which its turns alone say something else than its travel too.
 
-    open_, by_turns: (6, k) directions of each pose that nothing tells, and that turns do not.
+    open_, by_turns: (6, k) directions of each pose that nothing tells, and that turns do not. ahead: (3,) where the
+    base went: a travel that is turned about itself looks the same, so all axes lie across it.
     """
     axes = []
     for k, (directions, unturned) in enumerate(zip(open_, by_turns, strict=True)):
@@ -32,7 +35,7 @@ def axes(turned: Turning, open_: Sequence[Array], by_turns: Sequence[Array], fou
         apart = se3.log_so3(R[1] @ R[0].T)
         # what nothing told, or turns do not, may lie anywhere
         anywhere = np.concatenate([verdict.turns(directions), verdict.turns(unturned)], axis=1)[3:]
-        told = null_space(anywhere.T) if anywhere.size else np.eye(3)
+        told = null_space(np.column_stack([anywhere, ahead]).T)
         if not told.size:
             axes.append(told)
             continue
