@@ -124,10 +124,9 @@ def summary(draws: Sequence[Draw], reference: Array, title: str) -> str:
         poses = [d.alone.transform.T_a_b if name == "alone" else _pose(d.combined) for d in told]
         covs = [d.alone.transform.cov if name == "alone" else _cov(d.combined) for d in told]
         e, sigma = _errors(poses, reference), np.array([np.sqrt(np.diag(c)) for c in covs]) * UNITS
+        away = np.abs(e - np.median(e, axis=0))
         rows.append([name, "standard deviation", *_spread(e)])
-        rows.append(
-            [name, "by median absolute deviation", *1.4826 * np.median(abs(e - np.median(e, axis=0)), axis=0)]
-        )
+        rows.append([name, "by median absolute deviation", *1.4826 * np.median(away, axis=0)])
         rows.append([name, "median less reference", *np.median(e, axis=0)])
         rows.append([name, "stated sigma, median", *np.median(sigma, axis=0)])
         rows.append([name, "from the median by over 3 sigma, of all", *(away > 3 * sigma).sum(axis=0)])
