@@ -18,15 +18,15 @@ ASIDE_DEG = 10.0
 """An open direction counts as flagged if it is no further than this from what is flagged."""
 
 
-def draw_failures(rigs: int, first: int, longest: float) -> list[Rig]:
-    """A lidar that stands upright and an INS, on every kind of drive no longer than so many seconds."""
+def draw_failures(rigs: int, first: int, shortest: float, longest: float) -> list[Rig]:
+    """A lidar that stands upright and an INS, on every kind of drive of so many seconds."""
     counts = {s: max(rigs // len(LENGTHS), 1) for s in LENGTHS} | {HOUR: max(rigs // 10, 1)}
     failing = [(kind, s, count) for kind in KINDS for s, count in counts.items()]
     normal = [(kind, s, rigs) for kind in NORMAL_KINDS for s in NORMAL_LENGTHS]
     return [
         draw(seed, kind, 2, seconds, level=True)
         for kind, seconds, count in (*failing, *normal)
-        if seconds <= longest
+        if shortest <= seconds <= longest
         for seed in range(first, first + count)
     ]
 

@@ -116,10 +116,13 @@ def scale(rigs: int, first: int, jobs: int, out: Path | None, method: str) -> No
 
 @main.command()
 @options(200)
+@click.option("--shortest", type=click.FloatRange(0, HOUR), default=0.0, help="Shortest drive, seconds.")
 @click.option("--longest", type=click.FloatRange(LENGTHS[0]), default=HOUR, help="Longest drive, seconds.")
-def failures(rigs: int, first: int, jobs: int, out: Path | None, method: str, longest: float) -> None:
+def failures(
+    rigs: int, first: int, jobs: int, out: Path | None, method: str, shortest: float, longest: float
+) -> None:
     """What is flagged, and whether rightly: drives that leave directions open, and normal ones."""
-    found = solve_all(partial(look, method=method), draw_failures(rigs, first, longest), jobs, "failures")
+    found = solve_all(partial(look, method=method), draw_failures(rigs, first, shortest, longest), jobs, "failures")
     title = f"{method}, a lidar and an INS, {rigs} rigs of each kind"
     tell(tell_failures(found, title) + "\n" + tell_alarms(found, f"{title} and length"), out)
 
