@@ -56,7 +56,7 @@ import json
 import numpy as np
 from calib_toolkit import Calibration, Exporter, hookimpl
 
-def write(calibration, path):
+def write(calibration, path, intrinsics):
     path.write_text(json.dumps([calibration.base, list(calibration.names), calibration.T_base_sensor.tolist()]))
 
 def read(path):
@@ -237,7 +237,7 @@ def test_hook_calib_register_exporters(install: Install, tmp_path: Path) -> None
     rig = Calibration(
         "velo", ("velo", "cam0"), T, np.zeros(2), np.zeros((14, 14)), known, np.ones((2, 7), dtype=bool)
     )
-    exporter.write(rig, tmp_path / "rig.json")
+    exporter.write(rig, tmp_path / "rig.json", {})
     assert json.loads((tmp_path / "rig.json").read_text())[0] == "velo"
     assert np.array_equal(exporter.read(tmp_path / "rig.json").T_base_sensor, T)
 

@@ -91,27 +91,7 @@ def within(found: Comparison, names: Sequence[str]) -> Comparison:
     return _compared(found.a, found.b, names, found.a.t_ref)
 
 
-def _compared(a: Calibration, b: Calibration, names: Sequence[str], stamp: float) -> Comparison:
-    a, b = _rebased(a, names, stamp), _rebased(b, names, stamp)
-    known = a.determined & b.determined
-    a = _with(a, known, _turned_towards(a, b, ~known[:, 3:6]))
-    b = _with(b, known, b.T_base_sensor)
-    difference = np.concatenate(
-        [
-            b.T_base_sensor[:, :3, 3] - a.T_base_sensor[:, :3, 3],
-            _delta(a.T_base_sensor, b.T_base_sensor),
-            (b.dt_base_sensor - a.dt_base_sensor)[:, None],
-        ],
-        axis=1,
-    )
-    difference = np.where(known, difference, np.nan)
-    cov = a.covariance + b.covariance
-    rows = np.arange(7 * len(names)).reshape(-1, 7)
-    sensors = {name: _test(difference, cov, rows[i]) for i, name in enumerate(names) if i}
-    return Comparison(a, b, difference, cov, sensors, _test(difference, cov, rows[1:].ravel()))
-
-
-def _rebased(c: Calibration, names: Sequence[str], stamp: float) -> Calibration:
+def rebased(c: Calibration, names: Sequence[str], stamp: float) -> Calibration:
     """Some of the sensors in the frame and clock of the first of them, offsets as they are at a stamp."""
     rows, base = [c.index(name) for name in names], c.index(names[0])
     poses = np.nan_to_num(c.T_base_sensor)  # a position that is not known must not spoil what is
@@ -131,8 +111,29 @@ def _rebased(c: Calibration, names: Sequence[str], stamp: float) -> Calibration:
         _carried(J, c.covariance),
         c.has_scale[rows],
         c.determined[rows] if names[0] == c.base else _determined_between(c, base, rows),
+        clock_skew=c.clock_skew[rows] - c.clock_skew[base],
         t_ref=stamp,
     )
+
+
+def _compared(a: Calibration, b: Calibration, names: Sequence[str], stamp: float) -> Comparison:
+    a, b = rebased(a, names, stamp), rebased(b, names, stamp)
+    known = a.determined & b.determined
+    a = _with(a, known, _turned_towards(a, b, ~known[:, 3:6]))
+    b = _with(b, known, b.T_base_sensor)
+    difference = np.concatenate(
+        [
+            b.T_base_sensor[:, :3, 3] - a.T_base_sensor[:, :3, 3],
+            _delta(a.T_base_sensor, b.T_base_sensor),
+            (b.dt_base_sensor - a.dt_base_sensor)[:, None],
+        ],
+        axis=1,
+    )
+    difference = np.where(known, difference, np.nan)
+    cov = a.covariance + b.covariance
+    rows = np.arange(7 * len(names)).reshape(-1, 7)
+    sensors = {name: _test(difference, cov, rows[i]) for i, name in enumerate(names) if i}
+    return Comparison(a, b, difference, cov, sensors, _test(difference, cov, rows[1:].ravel()))
 
 
 def _carried(J: Array, cov: Array) -> Array:

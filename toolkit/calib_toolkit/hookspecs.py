@@ -14,7 +14,17 @@ import numpy as np
 import pluggy
 from numpy.typing import NDArray
 
-from calib_toolkit.types import Calibration, Log, Motions, Pair, PairEstimate, Stream, Trajectory, Transform
+from calib_toolkit.types import (
+    Calibration,
+    CameraIntrinsics,
+    Log,
+    Motions,
+    Pair,
+    PairEstimate,
+    Stream,
+    Trajectory,
+    Transform,
+)
 
 hookspec = pluggy.HookspecMarker("calib_toolkit")
 hookimpl = pluggy.HookimplMarker("calib_toolkit")
@@ -152,11 +162,24 @@ class Dataset:
 
 @dataclass(frozen=True)
 class Exporter:
-    """A format of calibrations, out and back in."""
+    """A format of calibrations, out and back in.
+
+    write: at a path where nothing is yet, a file or a folder, and beside it what the format has no place for; with
+    the intrinsics, by sensor, of the cameras whose intrinsics are known. Raises DataError for a rig or a name that
+    the format can not hold. read: what ``write`` wrote, or another program; covariance zero where the format has none,
+    and ``determined`` only what it says. Raises DataError.
+    matches: whether a path looks like this format (cheap; never raises). looks_for: what it looks for, in words.
+    loses: what it does not keep, in words. holds_unknown: whether ``write`` can say that a number is not determined;
+    else it is never given a pose that is not.
+    """
 
     id: str
-    write: Callable[[Calibration, Path], None]
+    write: Callable[[Calibration, Path, Mapping[str, CameraIntrinsics]], None]
     read: Callable[[Path], Calibration]
+    looks_for: str = ""
+    matches: Callable[[Path], bool] = lambda path: False
+    loses: str = ""
+    holds_unknown: bool = False
 
 
 class HookSpecs:

@@ -99,6 +99,24 @@ class Registry:
             raise DataError(f"{path} looks like {' and like '.join(d.id for d in found)}; choose with --format")
         return found[0].open(path, context)
 
+    def exporter(self, format_id: str) -> Exporter:
+        """The exporter of that name. Raises DataError."""
+        if format_id not in self.exporters:
+            raise DataError(f"no exporter is called '{format_id}'; there are: {', '.join(self.exporters)}")
+        return self.exporters[format_id]
+
+    def exporter_of(self, path: Path) -> Exporter:
+        """The one exporter that recognises what lies at a path. Raises DataError."""
+        if not path.exists():
+            raise DataError(f"{path} does not exist; name the file or folder of a calibration")
+        found = [e for e in self.exporters.values() if e.matches(path)]
+        if not found:
+            wanted = "; ".join(f"{e.id} looks for {e.looks_for}" for e in self.exporters.values() if e.looks_for)
+            raise DataError(f"no exporter knows {path} (choose with --from if it is one of these): {wanted}")
+        if len(found) > 1:
+            raise DataError(f"{path} looks like {' and like '.join(e.id for e in found)}; choose with --from")
+        return found[0]
+
 
 def registry(plugin_files: Iterable[Path] = ()) -> Registry:
     """The registry of everything installed, and of one-file plugins. Raises PluginError."""

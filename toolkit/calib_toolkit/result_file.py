@@ -24,9 +24,17 @@ def write_result(result: Result, file: Path) -> None:
     _write(result_dict(result), file)
 
 
-def write_calibration(calibration: Calibration, file: Path) -> None:
-    """Write one calibration alone (a truth, a measured rig) as JSON, whole or not at all."""
-    _write({"convention": CONVENTION, **calibration_dict(calibration)}, file)
+def write_calibration(calibration: Calibration, file: Path, sigmas: bool = True) -> None:
+    """Write one calibration alone (a truth, a measured rig) as JSON, whole or not at all.
+
+    sigmas: False where nobody states how sure the numbers are; the file then has neither sigma nor covariance.
+    """
+    content = {"convention": CONVENTION, **calibration_dict(calibration)}
+    if not sigmas:
+        del content["covariance"]
+        for sensor in content["sensors"].values():
+            del sensor["sigma"]
+    _write(content, file)
 
 
 def result_dict(result: Result) -> dict[str, Any]:

@@ -7,6 +7,7 @@ is wrong or not determined; 130 interrupted.
 import os
 from importlib import import_module
 from importlib.metadata import entry_points
+from keyword import iskeyword
 from typing import Any
 
 import click
@@ -18,6 +19,8 @@ COMMANDS = {
     "inspect": "Show what a recording holds and what is wrong with it.",
     "check": "Tell whether small moves would improve a calibration.",
     "compare": "Tell whether two results of one rig agree.",
+    "export": "Write a calibration in the format of another program.",
+    "import": "Read a calibration from the format of another program.",
     "evaluate": "Repeat the paper's experiments on drives whose truth is known.",
     "plugins": "List what is installed, and where from.",
     "demo": "Calibrate a simulated drive and show truth beside estimate.",
@@ -37,7 +40,8 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """The command of that name, imported now, or None if there is none. Raises PluginError."""
         if cmd_name in COMMANDS:
-            command: click.Command = getattr(import_module(f"calib_toolkit.cli.{cmd_name}"), cmd_name)
+            name = f"{cmd_name}_" if iskeyword(cmd_name) else cmd_name
+            command: click.Command = getattr(import_module(f"calib_toolkit.cli.{name}"), name)
             return command
         for point in entry_points(group=PLUGINS, name=cmd_name):
             try:

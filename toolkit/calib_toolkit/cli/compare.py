@@ -47,6 +47,10 @@ def compare(ctx: click.Context, a: Path, b: Path) -> None:
     base = found.a.base
     console.print(f"\n{b} minus {a}, each sensor in {base}:", markup=False, soft_wrap=True)
     console.print(_table(found))
+    exact = [str(file) for file, c in ((a, first), (b, second)) if not c.covariance.any()]
+    if exact:
+        said = f"{' and '.join(exact)}: no sigma is stated, so the numbers are taken as exact"
+        console.print(said, markup=False, soft_wrap=True)
     for sentence in _sentences(found):
         console.print(sentence, markup=False, soft_wrap=True)
     if found.overall.differs:

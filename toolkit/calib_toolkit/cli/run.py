@@ -28,7 +28,11 @@ if TYPE_CHECKING:
 )
 @click.option("--config", "config_file", type=click.Path(path_type=Path), help="TOML file of options.")
 @click.option(
-    "--prior", "prior_file", metavar="FILE", type=click.Path(path_type=Path), help="TOML of measured numbers."
+    "--prior",
+    "prior_file",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="TOML of measured numbers, or a JSON calibration.",
 )
 @click.option("--jobs", type=click.IntRange(min=1), help="Processes; one for each core by default.")
 @click.option("--seed", type=int, help="Seed of everything random.")
@@ -89,9 +93,9 @@ def _with_prior(config: "Config", file: Path) -> "Config":
     """The configuration with a file's measured numbers, in the base that the file names."""
     from dataclasses import replace
 
-    from calib_toolkit.prior_file import read_prior
+    from calib_toolkit.cli import prior as prior_files
 
-    prior = read_prior(file)
+    prior = prior_files.read(file)
     if prior.base and config.base and prior.base != config.base:
         raise ConfigError(
             f"the numbers in {file} are given in {prior.base}, and the base of this run is {config.base}; choose one"
