@@ -166,8 +166,8 @@ class Exporter:
 
     write: at a path where nothing is yet, a file or a folder, and beside it what the format has no place for; with
     the intrinsics, by sensor, of the cameras whose intrinsics are known. Raises DataError for a rig or a name that
-    the format can not hold. read: what ``write`` wrote, or another program; covariance zero where the format has none,
-    and ``determined`` only what it says. Raises DataError.
+    the format can not hold. read: what ``write`` wrote, or another program; covariance zero where the format has
+    none, and ``determined`` only what it says. Raises DataError.
     matches: whether a path looks like this format (cheap; never raises). looks_for: what it looks for, in words.
     loses: what it does not keep, in words. holds_unknown: whether ``write`` can say that a number is not determined;
     else it is never given a pose that is not.

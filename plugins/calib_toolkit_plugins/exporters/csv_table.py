@@ -1,6 +1,7 @@
 """CSV, for tables: one row for each sensor, cells empty where a number was not determined."""
 
 import csv
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -40,18 +41,22 @@ def write(c: Calibration, path: Path, intrinsics: Mapping[str, CameraIntrinsics]
         for r in plain.rows(c):
             numbers = (*r.translation, *r.quaternion, r.dt, r.clock_skew, c.t_ref, *r.sigma, int(r.has_scale))
             table.writerow([r.name, c.base, *numbers])
-        file.write(f"# {files.END}\n")
+        file.write(f"# {len(c.names)} sensors, {files.END}\n")
 
 
 def read(path: Path) -> Calibration:
     """The calibration, its covariance diagonal. Raises DataError."""
-    lines = [line for line in files.text(path).split("\n") if line.strip() and not line.startswith("#")]
+    content = files.text(path)
+    lines = [line for line in content.split("\n") if line.strip() and not line.startswith("#")]
     try:
         titles, *rows = csv.reader(lines, strict=True)
     except (csv.Error, ValueError) as e:
         raise DataError(f"{path} is no table of comma-separated values ({e}); correct it or fetch it again") from e
     if tuple(titles) != TITLES or not all(len(row) == len(TITLES) for row in rows):
         raise DataError(f"{path} must have the titles {','.join(TITLES)}, and as many cells in each row; correct it")
+    count = re.search(rf"^# (\d+) sensors, {files.END}$", content, re.MULTILINE)
+    if count and int(count[1]) != len(rows):
+        raise DataError(f"{path} has {len(rows)} rows, but its last line says {count[1]} sensors; correct it")
     tables = [dict(zip(TITLES, row, strict=True)) for row in rows]
     bases, stamps = {t["base"] for t in tables}, {t["t_ref"] for t in tables}
     if len(bases) != 1 or len(stamps) != 1:

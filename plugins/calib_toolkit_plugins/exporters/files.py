@@ -39,7 +39,7 @@ def text(file: Path) -> str:
     except (OSError, UnicodeDecodeError) as e:
         raise DataError(f"{file} can not be read as text ({type(e).__name__}); name a text file") from e
     lines = content.rstrip().split("\n")
-    if WRITTEN in lines[0] and not lines[-1].endswith(END):
+    if lines[0].startswith(("#", "comment:")) and WRITTEN in lines[0] and not lines[-1].endswith(END):
         raise DataError(f"{file} is cut short: its last line, '{END}', is missing; fetch or export it again")
     return content
 
