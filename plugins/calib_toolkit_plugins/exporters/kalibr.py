@@ -47,7 +47,7 @@ def write(c: Calibration, path: Path, intrinsics: Mapping[str, CameraIntrinsics]
         entry: dict[str, Any] = {"sensor": name, **({"imu": imu} if imu else {})}
         if imu:
             entry["T_cam_imu"] = c.between(name, imu).T_a_b.tolist()
-            sentences.append(f"cam{k}: T_cam_imu is {poses.direction(c, name, imu)}.")
+            sentences.append(f"cam{k}: T_cam_imu: {poses.direction(c, name, imu)}.")
             if c.determined[[c.index(name), c.index(imu)], 6].all():
                 entry["timeshift_cam_imu"] = c.dt_between(imu, name)[0]
                 sentences.append(f"cam{k}: timeshift_cam_imu (s) is added to {name}'s stamp to get {imu}'s time.")
@@ -55,7 +55,7 @@ def write(c: Calibration, path: Path, intrinsics: Mapping[str, CameraIntrinsics]
                 sentences.append(f"cam{k}: timeshift_cam_imu was not determined, so it is missing. It is not zero.")
         if k:
             entry["T_cn_cnm1"] = c.between(name, seen[k - 1]).T_a_b.tolist()
-            sentences.append(f"cam{k}: T_cn_cnm1 is {poses.direction(c, name, seen[k - 1])}.")
+            sentences.append(f"cam{k}: T_cn_cnm1: {poses.direction(c, name, seen[k - 1])}.")
         chain[f"cam{k}"] = {**entry, **_camera(name, intrinsics.get(name))}
     sentences.append(f"Clock offsets: also in {clocks.beside(path).name}, with what this format has no place for.")
     clocks.write(c, path)

@@ -7,7 +7,7 @@ import click
 
 @click.command()
 @click.argument("calibration", metavar="CALIBRATION.json", type=click.Path(path_type=Path))
-@click.option("--to", "format_id", metavar="FORMAT", required=True, help="Such as ros2, urdf, kalibr; see below.")
+@click.option("--to", "format_id", metavar="FORMAT", required=True, help="Such as ros2, urdf or kalibr.")
 @click.option("-o", "--out", type=click.Path(path_type=Path), required=True, help="File, or folder for kitti.")
 @click.option("--sensors", metavar="A,B,...", help="Sensors to write, by their names; all by default.")
 @click.option(
