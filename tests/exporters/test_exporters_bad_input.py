@@ -230,7 +230,7 @@ def test_plain_files_that_contradict_themselves(exporting, where, value, sentenc
 def test_a_table_that_lost_a_row_is_refused(exporting):
     path = exporting.write(ordinary("csv"), "csv")
     path.write_text(re.sub(r"^ins,.*\n", "", path.read_text(), flags=re.MULTILINE))
-    with pytest.raises(DataError, match="has 3 rows, and its last line says 4 sensors"):
+    with pytest.raises(DataError, match="has 3 rows, but its last line says 4 sensors"):
         exporting.read(path, "csv")
 
 
