@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from calib_toolkit.hookspecs import ReadContext as ReadContext
     from calib_toolkit.hookspecs import Sensor as Sensor
     from calib_toolkit.hookspecs import SensorTable as SensorTable
+    from calib_toolkit.hookspecs import Written as Written
     from calib_toolkit.hookspecs import hookimpl as hookimpl
     from calib_toolkit.paths import poses_at as poses_at
     from calib_toolkit.pipeline import calibrate as calibrate
@@ -56,6 +57,7 @@ _HOMES = {
             "ReadContext",
             "Sensor",
             "SensorTable",
+            "Written",
             "hookimpl",
         ),
     ],

@@ -14,6 +14,7 @@ import numpy as np
 import pluggy
 from numpy.typing import NDArray
 
+from calib_toolkit.progress import Progress
 from calib_toolkit.types import (
     Calibration,
     CameraIntrinsics,
@@ -146,18 +147,28 @@ class ReadContext:
 
 
 @dataclass(frozen=True)
+class Written:
+    """What a conversion wrote. readings: number by sensor. lost: a sentence for whatever was not written, and why."""
+
+    readings: Mapping[str, int]
+    lost: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Dataset:
     """A format of recordings.
 
     matches: whether a path looks like this format (cheap; never raises). looks_for: what it looks for, in
     words, for the sentence when no reader knows a path. open: a Log whose readings stay on disk.
+    write: makes such a recording of a log at a path where nothing is yet, reading by reading; what is there in the end
+    is put in its place by the caller. ``progress.advance(sensor, n)`` tells of n readings. Raises DataError.
     """
 
     id: str
     looks_for: str
     matches: Callable[[Path], bool]
     open: Callable[[Path, ReadContext], Log]
-    write: Callable[[Log, Path], None] | None = None
+    write: Callable[[Log, Path, Progress], Written] | None = None
 
 
 @dataclass(frozen=True)

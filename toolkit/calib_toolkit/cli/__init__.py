@@ -17,6 +17,7 @@ from calib_toolkit.errors import CalibrationError, PluginError
 COMMANDS = {
     "run": "Calibrate the sensors of a drive.",
     "inspect": "Show what a recording holds and what is wrong with it.",
+    "convert": "Write a recording in another format.",
     "check": "Tell whether small moves would improve a calibration.",
     "compare": "Tell whether two results of one rig agree.",
     "export": "Write a calibration in the format of another program.",

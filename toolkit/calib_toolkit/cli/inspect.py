@@ -3,8 +3,14 @@
 import math
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from calib_toolkit.types import Log
 
 
 @click.command()
@@ -39,11 +45,33 @@ def inspect(ctx: click.Context, drive: Path, format_id: str | None, plugins: tup
             escape(s.name), escape(s.kind), str(s.readings), *numbers, str(s.gaps), _number(s.largest_gap, 4)
         )
     console.print(table)
+    if log.topics:
+        _show_topics(log, console)
     for problem in seen.problems:
         console.print(f"- {problem}", markup=False, soft_wrap=True)
     if not seen.clean:
         ctx.exit(3)
     console.print("nothing wrong was found")
+
+
+def _show_topics(log: "Log", console: "Console") -> None:
+    """All that was recorded, what it is taken for, and how to name it."""
+    from rich.box import SIMPLE
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=SIMPLE)
+    for column in ("topic", "type"):
+        table.add_column(column, overflow="fold")
+    for column in ("messages", "rate Hz"):
+        table.add_column(column, justify="right")
+    table.add_column("sensor, or why it is none", overflow="fold")
+    for t in log.topics:
+        cells = (t.name, t.type.replace("/msg/", "/"), str(t.messages), _number(t.rate, 2), t.sensor or t.unused)
+        table.add_row(*map(escape, cells))
+    console.print(table)
+    names = ",".join(f"{s.name}={s.topic}" for s in log.streams.values())
+    console.print(f"--sensors {names}", markup=False, soft_wrap=True)
 
 
 def _date(epoch_ns: int) -> str:

@@ -6,7 +6,7 @@ from calib_toolkit.types.motions import Motions, Trajectory
 from calib_toolkit.types.pairs import Pair, PairEstimate
 from calib_toolkit.types.readings import Fix, LazyReadings, MotionReading, PoseReading, Scan
 from calib_toolkit.types.result import Result
-from calib_toolkit.types.streams import CameraIntrinsics, Log, Stream
+from calib_toolkit.types.streams import CameraIntrinsics, Log, Stream, Topic
 
 __all__ = [
     "Calibration",
@@ -23,6 +23,7 @@ __all__ = [
     "Result",
     "Scan",
     "Stream",
+    "Topic",
     "Trajectory",
     "Transform",
     "Undetermined",

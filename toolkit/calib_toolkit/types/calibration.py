@@ -1,7 +1,7 @@
 """Where each sensor sits and how late its clock is, with the joint uncertainty of everything."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +71,26 @@ class Calibration:
     def index(self, name: str) -> int:
         """Row of a sensor."""
         return self.names.index(name)
+
+    def renamed(self, names: Mapping[str, str]) -> "Calibration | None":
+        """The same with other names for some sensors, and without those whose names are taken; None if the base's is."""
+        taken = {new for old, new in names.items() if new != old}
+        if self.base in taken and self.base not in names:
+            return None
+        keep = [i for i, n in enumerate(self.names) if n in names or n not in taken]
+        rows = (7 * np.array(keep)[:, None] + np.arange(7)).ravel()
+        return replace(
+            self,
+            base=names.get(self.base, self.base),
+            names=tuple(names.get(self.names[i], self.names[i]) for i in keep),
+            T_base_sensor=self.T_base_sensor[keep],
+            dt_base_sensor=self.dt_base_sensor[keep],
+            covariance=self.covariance[np.ix_(rows, rows)],
+            has_scale=self.has_scale[keep],
+            determined=self.determined[keep],
+            undetermined=(),
+            clock_skew=self.clock_skew[keep],
+        )
 
     @property
     def sigma(self) -> Array:

@@ -39,6 +39,7 @@ class Stream:
     clock: streams that name one clock share one timing offset (the heads of a ladybug); default: own clock.
     options: defaults for the sensor plugin's options that belong to this recording.
     notes: sentences on what was wrong with the recording and what was done about it.
+    topic: what the recording itself calls it, if it has another name there.
     """
 
     name: str
@@ -50,6 +51,7 @@ class Stream:
     clock: str = ""
     options: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    topic: str = ""
 
     def __post_init__(self) -> None:
         stamps = np.asarray(self.stamps, dtype=np.float64)
@@ -78,6 +80,10 @@ class Stream:
     def __getitem__(self, part: slice) -> "Stream":
         return replace(self, stamps=self.stamps[part], readings=self.readings[part])
 
+    def named(self, name: str) -> "Stream":
+        """The same under another name; a clock of its own goes with it."""
+        return replace(self, name=name, clock=name if self.clock == self.name else self.clock)
+
     @property
     def period(self) -> float:
         """Median time between readings, seconds; nan with fewer than two readings."""
@@ -90,11 +96,26 @@ class Stream:
 
 
 @dataclass(frozen=True)
+class Topic:
+    """One topic of a recording that has such. rate: messages a second, nan for fewer than two.
+
+    sensor: the stream that it is a part of, "" for none, and ``unused`` then says why.
+    """
+
+    name: str
+    type: str
+    messages: int
+    rate: float
+    sensor: str = ""
+    unused: str = ""
+
+
+@dataclass(frozen=True)
 class Log:
     """A recorded drive.
 
     epoch_ns: unix nanoseconds that stamp 0.0 stands for. reference: a calibration that came with the
-    recording, used only to compare with, never to calibrate.
+    recording, used only to compare with, never to calibrate. topics: all that was recorded, where it was by topics.
     """
 
     source: Path
@@ -102,20 +123,37 @@ class Log:
     epoch_ns: int = 0
     reference: Calibration | None = None
     notes: tuple[str, ...] = ()
+    topics: tuple[Topic, ...] = ()
 
     def select(self, names: Sequence[str] | None) -> "Log":
-        """The log with only the named sensors, in that order (all of them when names is None)."""
+        """The log with only the named sensors, in that order (all of them when names is None).
+
+        A name is that of a stream or its topic; ``new=old`` gives it another one, here and in the reference.
+        """
         if names is None:
             return self
-        for name in names:
-            if name not in self.streams:
-                raise DataError(
-                    f"{self.source} has no sensor named '{name}'; it has: {', '.join(self.streams) or 'none'}"
-                )
-        doubled = [n for i, n in enumerate(names) if n in names[:i]]
-        if doubled:
-            raise DataError(f"sensor '{doubled[0]}' is named twice in the list of sensors; name it once")
-        return replace(self, streams={name: self.streams[name] for name in names})
+        pairs = [(new if equals else "", old or new) for new, equals, old in (n.partition("=") for n in names)]
+        found = [self._called(old) for _, old in pairs]
+        renamed = {old: new or old for (new, _), old in zip(pairs, found, strict=True)}
+        for listed in (found, list(renamed.values())):
+            doubled = [n for i, n in enumerate(listed) if n in listed[:i]]
+            if doubled:
+                raise DataError(f"sensor '{doubled[0]}' is named twice in the list of sensors; name it once")
+        streams = {new: self.streams[old].named(new) for old, new in renamed.items()}
+        reference = self.reference
+        if reference is not None and any(new != old for old, new in renamed.items()):
+            reference = reference.renamed(renamed)
+        return replace(self, streams=streams, reference=reference)
+
+    def _called(self, wanted: str) -> str:
+        """The stream of that name or topic."""
+        by_topic = [name for name, s in self.streams.items() if s.topic == wanted]
+        if wanted in self.streams or by_topic:
+            return wanted if wanted in self.streams else by_topic[0]
+        why = next((f" ({t.unused})" for t in self.topics if t.name == wanted and t.unused), "")
+        raise DataError(
+            f"{self.source} has no sensor named '{wanted}'{why}; it has: {', '.join(self.streams) or 'none'}"
+        )
 
     @property
     def span(self) -> tuple[float, float]:

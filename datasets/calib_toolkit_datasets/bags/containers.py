@@ -1,0 +1,147 @@
+"""Recordings of each kind: which files belong to one, all messages in them, and the bytes of one message."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from calib_toolkit.errors import DataError
+from calib_toolkit_datasets.bags import bag1, mcap, sqlite
+from calib_toolkit_datasets.bags.index import Bag, Damaged, Index, Key, Source
+
+METADATA = "metadata.yaml"
+LONGEST_METADATA = 2**24
+"""Bytes of a metadata.yaml; it lists topics and files."""
+SUFFIXES = (".db3", ".mcap")
+
+
+def starts_with(path: Path, magic: bytes) -> bool:
+    """Whether a path is a file that begins so."""
+    try:
+        with path.open("rb") as file:
+            return file.read(len(magic)) == magic
+    except OSError:
+        return False
+
+
+def is_bag1(path: Path) -> bool:
+    """Whether a path is a ROS 1 bag."""
+    return starts_with(path, bag1.MAGIC[:8])
+
+
+def is_mcap(path: Path) -> bool:
+    """Whether a path is an MCAP file."""
+    return starts_with(path, mcap.MAGIC)
+
+
+def is_bag2(path: Path) -> bool:
+    """Whether a path is the folder of a ROS 2 bag, or a file of one that SQLite stores."""
+    try:
+        if path.is_dir():
+            return any(p.suffix in SUFFIXES for p in path.iterdir())
+    except OSError:
+        return False
+    return path.suffix == ".db3" and starts_with(path, sqlite.MAGIC)
+
+
+def open_bag1(path: Path) -> Bag:
+    """A ROS 1 bag. Raises DataError."""
+    return _found(Source((path,), "bag1"), ())
+
+
+def open_mcap(path: Path) -> Bag:
+    """An MCAP file. Raises DataError."""
+    return _found(Source((path,), "mcap"), ())
+
+
+def open_bag2(path: Path) -> Bag:
+    """The folder of a ROS 2 bag, its files in the order of its metadata.yaml, or a ``.db3``. Raises DataError."""
+    if not path.is_dir():
+        return _found(Source((path,), "sqlite"), ())
+    present = sorted((p for p in path.iterdir() if p.suffix in SUFFIXES), key=lambda p: (len(p.name), p.name))
+    if not (path / METADATA).is_file():
+        note = f"{path} has no {METADATA}, as if its recording was killed; its files are read in the order of names"
+        return _found(_source(path, present, ""), (note,))
+    files, mode = _listed(path)
+    missing = [f.name for f in files if not f.is_file()]
+    if missing:
+        raise DataError(f"{path / METADATA} lists {missing[0]}, which is missing; copy the whole folder")
+    notes = [f"{path.name}: {p.name} is not in its {METADATA} and is left out" for p in present if p not in files]
+    return _found(_source(path, files, mode), tuple(notes))
+
+
+def fetch(source: Source, key: Key) -> bytes:
+    """The bytes of one message. Raises DataError."""
+    file = source.files[key[0]]
+    try:
+        return _FETCH[source.storage](file, key)
+    except (Damaged, OSError) as e:
+        raise DataError(f"{file}: {e}; copy or record it again") from e
+
+
+_FETCH: dict[str, Callable[[Path, Key], bytes]] = {
+    "bag1": bag1.fetch,
+    "mcap": mcap.fetch,
+    "sqlite": partial(sqlite.fetch, packed=False),
+    "sqlite-zstd": partial(sqlite.fetch, packed=True),
+}
+_SCAN: dict[str, Callable[[Path, int, Index], None]] = {
+    "bag1": bag1.scan,
+    "mcap": mcap.scan,
+    "sqlite": partial(sqlite.scan, packed=False),
+    "sqlite-zstd": partial(sqlite.scan, packed=True),
+}
+
+
+def _found(source: Source, notes: Sequence[str]) -> Bag:
+    index = Index(notes=list(notes))
+    for number, file in enumerate(source.files):
+        try:
+            _SCAN[source.storage](file, number, index)
+        except Damaged as e:
+            index.notes.append(f"{file} is damaged: {e}; only what comes before is used")
+        except OSError as e:
+            raise DataError(f"{file} can not be read ({e.strerror}); make it readable") from e
+    return index.bag(source)
+
+
+def _source(folder: Path, files: Sequence[Path], mode: str) -> Source:
+    kinds = {f.suffix for f in files}
+    if len(kinds) != 1:
+        raise DataError(f"{folder} must hold files of one kind, {' or '.join(SUFFIXES)}; name one file, or sort them")
+    if kinds == {".mcap"}:
+        return Source(tuple(files), "mcap")
+    return Source(tuple(files), "sqlite-zstd" if mode == "message" else "sqlite")
+
+
+def _listed(folder: Path) -> tuple[list[Path], str]:
+    """Files that a metadata.yaml lists, none outside its folder, and the mode of compression."""
+    file = folder / METADATA
+    try:
+        content = _yaml(file)["rosbag2_bagfile_information"]
+        names, mode = [str(n) for n in content["relative_file_paths"]], str(content.get("compression_mode") or "")
+    except (KeyError, TypeError, AttributeError) as e:
+        raise DataError(f"{file} is not that of a ROS 2 bag ({e}); remove it to read the files in order") from e
+    names = [n.removeprefix(f"{folder.name}/") for n in names]  # the first versions wrote them so
+    outside = [n for n in names if Path(n).is_absolute() or ".." in Path(n).parts]
+    if outside:
+        raise DataError(f"{file} lists {outside[0]}, which lies outside its folder; list files of this folder only")
+    if not names:
+        raise DataError(f"{file} lists no files; remove it to read those that are there")
+    if mode.lower() == "file":
+        raise DataError(f"{folder} is compressed file by file; unpack {names[0]} with zstd -d, and remove {METADATA}")
+    return [folder / n for n in names], mode.lower()
+
+
+def _yaml(file: Path) -> Any:
+    """Plain YAML: a tag that asks for anything to be made is refused. Raises DataError."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        if file.stat().st_size > LONGEST_METADATA:
+            raise DataError(f"{file} is larger than any list of topics; remove it to read the files in order of names")
+        return YAML(typ="safe", pure=True).load(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, YAMLError, RecursionError, ArithmeticError) as e:
+        why = " ".join(str(e).split())[:200]
+        raise DataError(f"{file} can not be read ({why}); remove it to read the files in order of names") from e
