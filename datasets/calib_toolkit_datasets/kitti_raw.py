@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calib_toolkit import CameraIntrinsics, Dataset, LazyReadings, Log, ReadContext, Stream, hookimpl, se3, tables
 from calib_toolkit.errors import DataError
 from calib_toolkit.types import Calibration, Fix
-from calib_toolkit_datasets import kitti_files, stamps
+from calib_toolkit_datasets import kitti_files, kitti_writing, stamps
 
 Array = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ LONGEST_SWEEP = 1.0  # seconds; start and end stamps further apart do not belong
 def calib_register_datasets() -> list[Dataset]:
     """The ``kitti-raw`` reader."""
     looks_for = "a drive folder with timestamps.txt in velodyne_points, image_00 to image_03 or oxts"
-    return [Dataset("kitti-raw", looks_for, matches, open_log)]
+    return [Dataset("kitti-raw", looks_for, matches, open_log, kitti_writing.write)]
 
 
 def matches(path: Path) -> bool:

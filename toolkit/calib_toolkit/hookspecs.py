@@ -148,10 +148,14 @@ class ReadContext:
 
 @dataclass(frozen=True)
 class Written:
-    """What a conversion wrote. readings: number by sensor. lost: a sentence for whatever was not written, and why."""
+    """What a conversion wrote. readings: number by sensor. lost: a sentence for whatever was not written, and why.
+
+    inside: the recording's path in what was written, if it is not the whole.
+    """
 
     readings: Mapping[str, int]
     lost: tuple[str, ...] = ()
+    inside: str = ""
 
 
 @dataclass(frozen=True)
@@ -160,8 +164,8 @@ class Dataset:
 
     matches: whether a path looks like this format (cheap; never raises). looks_for: what it looks for, in
     words, for the sentence when no reader knows a path. open: a Log whose readings stay on disk.
-    write: makes such a recording of a log at a path where nothing is yet, reading by reading; what is there in the end
-    is put in its place by the caller. ``progress.advance(sensor, n)`` tells of n readings. Raises DataError.
+    write: makes such a recording of a log at a path where nothing is yet, reading by reading, and tells ``progress``
+    of each; the caller moves it to where it belongs once it is whole. Raises DataError.
     """
 
     id: str

@@ -1,4 +1,6 @@
-"""What a gyroscope or a receiver tells on its own: turns without travel, and travel whose direction is the heading."""
+"""What a gyroscope or a receiver tells on its own: turns without travel, and travel that tells the heading."""
+
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +13,13 @@ Array = NDArray[np.float64]
 STEP = 0.05
 """Seconds that the turns of a gyroscope are added up to."""
 NOISE = 0.002
-"""Radians a second by which a turn rate is off when nothing is stated: of a cheap gyroscope at rest, with its drift."""
+"""Radians a second by which turn rates are off: of a cheap gyroscope, its drift included."""
 QUIET = 2.0
 """Seconds of rest from which a bias is told."""
-STILL = 0.02
-"""Radians a second: at rest turn rates vary less than this, and are no larger than ``LARGEST_BIAS``."""
+STILL, SHAKEN = 0.02, 0.06
+"""By which turn rates (radians a second) and accelerations (metres a second squared) vary less at rest. A vehicle that
+goes straight turns as little, but shakes.
+"""
 LARGEST_BIAS = 0.1
 SLIP = np.radians(2.0)
 """By how much a vehicle points elsewhere than it goes."""
@@ -29,20 +33,22 @@ FAR = 0.5
 """Seconds before and after a position over which its course is told."""
 
 
-def gyro_steps(stamps: Array, rates: Array) -> tuple[NDArray[np.int64], list[MotionReading], Array | None]:
+def gyro_steps(
+    stamps: Array, rates: Array, accelerations: Array
+) -> tuple[NDArray[np.int64], list[MotionReading], Array | None]:
     """Turns integrated from angular rates: rows that are readings, the readings, and the bias that was taken off.
 
-    stamps: (n,) seconds. rates: (n, 3) radians a second, sensor axes. Translations say nothing: length one in some
+    stamps: (n,) seconds. rates: (n, 3) radians a second; accelerations: (n, 3), zero if not known. Translations say nothing: length one in some
     direction with a variance of one, to be used without scale. Bias: (3,), None if the vehicle never stood.
     """
-    bias = _bias(stamps, rates)
+    bias = _bias(stamps, rates, accelerations)
     rates = rates - (0.0 if bias is None else bias)
     dt = np.diff(stamps)
     together = max(1, round(STEP / max(float(np.median(dt)), 1e-4)))
     rows = np.arange(0, len(stamps), together)
     turns = Rotation.from_rotvec((rates[1:] + rates[:-1]) / 2 * dt[:, None])
     readings = [MotionReading(None)]
-    for a, b in zip(rows[:-1], rows[1:], strict=True):
+    for a, b in pairwise(rows):
         turn = Rotation.identity()
         for k in range(a, b):
             turn = turn * turns[k]
@@ -62,8 +68,9 @@ def with_course(stamps: Array, fixes: list[Fix], usual: float) -> list[Fix]:
     radius = 6371000.0 + alt
     flat = np.stack([(lon - lon[0]) * radius * np.cos(lat), (lat - lat[0]) * radius, alt - alt[0]], axis=1)
     before, after = (np.searchsorted(stamps, stamps + d) for d in (-FAR, FAR))
-    before, after = np.minimum(before, np.arange(len(stamps)) - 1).clip(0), np.minimum(
-        np.maximum(after, np.arange(len(stamps)) + 1), len(stamps) - 1
+    before, after = (
+        np.minimum(before, np.arange(len(stamps)) - 1).clip(0),
+        np.minimum(np.maximum(after, np.arange(len(stamps)) + 1), len(stamps) - 1),
     )
     went = flat[after] - flat[before]
     took = np.maximum(stamps[after] - stamps[before], 1e-6)
@@ -83,15 +90,13 @@ def with_course(stamps: Array, fixes: list[Fix], usual: float) -> list[Fix]:
     ]
 
 
-def _bias(stamps: Array, rates: Array) -> Array | None:
+def _bias(stamps: Array, rates: Array, accelerations: Array) -> Array | None:
     """(3,) mean of the quietest stretches, the vehicle standing."""
     size = int(np.searchsorted(stamps, stamps[0] + QUIET))
-    if size < 10 or len(stamps) < size:
+    if size < 10 or len(stamps) < size or not np.any(accelerations):
         return None
-    parts = rates[: len(rates) // size * size].reshape(-1, size, 3)
+    parts, shakes = (x[: len(x) // size * size].reshape(-1, size, 3) for x in (rates, accelerations))
     mean, spread = parts.mean(axis=1), parts.std(axis=1).max(axis=1)
     still = (spread < STILL) & (np.abs(mean).max(axis=1) < LARGEST_BIAS)
-    still &= spread < 2 * spread.min()
+    still &= shakes.std(axis=1).max(axis=1) < SHAKEN
     return np.median(mean[still], axis=0) if still.any() else None
-
-

@@ -58,9 +58,9 @@ def load_scan(key: Key, source: Source, topic: str, encoding: str, timing: Timin
 
 
 def told_timing(key: Key, source: Source, topic: str, encoding: str, period: float) -> tuple[Timing | None, str]:
-    """How a driver tells the time of points, from one of its sweeps, and a sentence where that is odd or missing.
+    """How a driver tells the time of points, and a sentence where that is odd or missing; from one of its sweeps.
 
-    period: seconds from one sweep to the next. The unit is that in which a sweep lasts about as long. Raises DataError.
+    period: seconds from one sweep to the next. The unit is that in which a sweep lasts as long. Raises DataError.
     """
     where = place(key, source, topic)
     message = load(key, source, topic, KIND, encoding)
@@ -76,8 +76,8 @@ def told_timing(key: Key, source: Source, topic: str, encoding: str, period: flo
     units = [u for u in UNITS if SWEEP[0] * period <= span * u <= SWEEP[1] * period]
     if not units:
         return None, (
-            f"{topic}: its field '{there[0]}' spans {span:g} a sweep, which is no unit of time for one of {period:.3f} s; "
-            "scans are not straightened"
+            f"{topic}: its field '{there[0]}' spans {span:g} a sweep, in no unit of time the {period:.3f} s from one "
+            "to the next; scans are not straightened"
         )
     timing = Timing(there[0], units[0], "stamp")
     if np.abs(raw).max() * units[0] <= 2 * SWEEP[1] * period:
@@ -94,7 +94,11 @@ def told_timing(key: Key, source: Source, topic: str, encoding: str, period: flo
 
 def to_message(scan: Scan, header: Any, types: Any) -> Any:
     """A cloud with x, y, z and, as far as the scan has them, intensity, ring and time (seconds from the stamp)."""
-    fields = [("x", "<f4", scan.points[:, 0]), ("y", "<f4", scan.points[:, 1]), ("z", "<f4", scan.points[:, 2])]
+    fields: list[tuple[str, str, NDArray[Any]]] = [
+        ("x", "<f4", scan.points[:, 0]),
+        ("y", "<f4", scan.points[:, 1]),
+        ("z", "<f4", scan.points[:, 2]),
+    ]
     if scan.intensity is not None:
         fields.append(("intensity", "<f4", scan.intensity))
     if scan.ring is not None:
@@ -121,7 +125,9 @@ def _columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
     for field in message.fields:
         kind = TYPES.get(field.datatype)
         if kind is None or field.offset + int(kind[1]) > step:
-            raise DataError(f"{where}: its field '{field.name}' has no known type or lies beyond the point; leave it out")
+            raise DataError(
+                f"{where}: its field '{field.name}' has no known type or lies beyond the point; leave it out"
+            )
         if field.count <= 1 and field.name not in names:
             names.append(field.name)
             formats.append(order + kind)

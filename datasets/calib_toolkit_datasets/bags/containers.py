@@ -140,7 +140,9 @@ def _yaml(file: Path) -> Any:
 
     try:
         if file.stat().st_size > LONGEST_METADATA:
-            raise DataError(f"{file} is larger than any list of topics; remove it to read the files in order of names")
+            raise DataError(
+                f"{file} is larger than any list of topics; remove it to read the files in order of names"
+            )
         return YAML(typ="safe", pure=True).load(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, YAMLError, RecursionError, ArithmeticError) as e:
         why = " ".join(str(e).split())[:200]

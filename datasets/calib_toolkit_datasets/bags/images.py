@@ -87,7 +87,9 @@ def _pixels(message: Any, where: str) -> NDArray[Any]:
     encoding = PLAIN.get(message.encoding, message.encoding)
     match = ENCODING.fullmatch(encoding)
     if match is None and encoding not in YUV:
-        raise DataError(f"{where} is an image of encoding '{message.encoding}', which is not read; name another topic")
+        raise DataError(
+            f"{where} is an image of encoding '{message.encoding}', which is not read; name another topic"
+        )
     bayer = match is not None and match["name"].startswith("bayer")
     channels = 2 if match is None else 1 if bayer else CHANNELS[match["name"]]
     wide = match is not None and match["bits"] == "16"

@@ -1,5 +1,6 @@
 """Where every message of a recording lies: what one pass over its files leaves in memory."""
 
+import struct
 from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -125,8 +126,7 @@ def header_stamp(head: bytes | memoryview, encoding: str) -> int:
     if len(head) < HEAD:
         return tables.BLANK
     big = encoding == "cdr" and head[1] == 0
-    order = "big" if big else "little"
-    seconds, rest = int.from_bytes(head[4:8], order), int.from_bytes(head[8:12], order)
+    seconds, rest = struct.unpack_from(">II" if big else "<II", head, 4)
     if rest >= 10**9 or (seconds == 0 and rest == 0) or seconds >= 2**31:
         return tables.BLANK
-    return seconds * 10**9 + rest
+    return int(seconds * 10**9 + rest)

@@ -1,7 +1,7 @@
 """Topics as sensors: which of them are, what they are called, and whose stamps are odd."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,17 +10,18 @@ from numpy.typing import NDArray
 from calib_toolkit import Calibration, Dataset, Log, ReadContext, Stream, hookimpl, tables
 from calib_toolkit.errors import DataError
 from calib_toolkit.types import Topic
-from calib_toolkit_datasets.bags import containers, frames, messages, sensors
+from calib_toolkit_datasets.bags import clocks, containers, frames, messages, sensors
 from calib_toolkit_datasets.bags.index import Bag, Recorded
 from calib_toolkit_datasets.bags.writing import write_bag1, write_bag2, write_mcap
 
 GENERIC = frozenset(
-    "image image_raw image_color image_mono image_rect image_rect_color compressed points points_raw point_cloud "
-    "pointcloud cloud data raw fix navsat imu odom odometry pose sensor_msgs".split()
+    (
+        *("image", "image_raw", "image_color", "image_mono", "image_rect", "image_rect_color", "compressed"),
+        *("points", "points_raw", "point_cloud", "pointcloud", "cloud", "fix", "navsat", "imu", "odom", "odometry"),
+        *("pose", "data", "raw"),
+    )
 )
 """Last parts of topics that tell what they are and not whose."""
-CLOCKS_APART = 5.0
-"""Seconds between two sensors' clocks, by when their messages arrived, from which one is brought to the other."""
 
 
 @hookimpl
@@ -51,10 +52,10 @@ def open_mcap(path: Path, context: ReadContext) -> Log:
 def to_log(path: Path, bag: Bag) -> Log:
     """A stream for each topic that a sensor reads, on the clock of the messages' headers."""
     why = {name: messages.unreadable(r.channel) for name, r in bag.topics.items()}
-    usable = {name: usable_stamps(name, r) for name, r in bag.topics.items() if not why[name]}
+    usable = {name: clocks.usable_stamps(name, r) for name, r in bag.topics.items() if not why[name]}
     why |= {name: u.reason for name, u in usable.items() if u.reason}
     clean = {name: u for name, u in usable.items() if not u.reason}
-    shifts = _shifts({n: u for n, u in clean.items() if u.recorded.channel.type in sensors.KINDS})
+    shifts = clocks.shifts({n: u for n, u in clean.items() if u.recorded.channel.type in sensors.KINDS})
     clean = {n: replace(u, ns=u.ns + shifts.get(n, 0)) for n, u in clean.items()}
     made = sensors.streams(bag, clean, why)
     if not made:
@@ -73,7 +74,7 @@ def to_log(path: Path, bag: Bag) -> Log:
             m.intrinsics,
             m.has_scale,
             clock,
-            notes=(*(n for t in m.topics for n in usable[t].notes), *_shifted(topic, shifts), *m.notes),
+            notes=(*(n for t in m.topics for n in usable[t].notes), *clocks.shifted(topic, shifts), *m.notes),
             topic=topic,
         )
     notes, reference = list(bag.notes), None
@@ -87,58 +88,6 @@ def to_log(path: Path, bag: Bag) -> Log:
         for name, r in sorted(bag.topics.items())
     )
     return Log(path, streams, epoch_ns, reference, tuple(notes), listed)
-
-
-@dataclass(frozen=True)
-class Usable:
-    """The messages of a topic whose stamps can be used. rows: of ``recorded``. ns: (n,) increasing.
-
-    reason: why there are none, "" if there are. notes: what was left out.
-    """
-
-    recorded: Recorded
-    rows: NDArray[np.int64]
-    ns: tables.Nanoseconds
-    reason: str = ""
-    notes: tuple[str, ...] = ()
-
-
-def usable_stamps(name: str, recorded: Recorded) -> Usable:
-    """Rows with a stamp, the fewest left out so that stamps increase."""
-    stamps = recorded.stamps
-    if recorded.channel.type in messages.FRAMES:
-        return Usable(recorded, np.arange(len(stamps)), recorded.received)
-    rows = np.flatnonzero(stamps != tables.BLANK)
-    none = np.zeros(0, dtype=np.int64)
-    if not len(stamps):
-        return Usable(recorded, none, none, "it has no messages")
-    if not len(rows):
-        return Usable(recorded, none, none, "the stamps in its headers are zero or make no sense")
-    keep = tables.increasing(stamps[rows])
-    notes = []
-    if len(rows) < len(stamps):
-        notes.append(f"{name}: {len(stamps) - len(rows)} of {len(stamps)} messages without a stamp are left out")
-    if not keep.all():
-        notes.append(f"{name}: {np.sum(~keep)} of {len(stamps)} messages whose stamps repeat or go back are left out")
-    rows = rows[keep]
-    return Usable(recorded, rows, stamps[rows], "", tuple(notes))
-
-
-def _shifts(usable: Mapping[str, Usable]) -> dict[str, int]:
-    """Nanoseconds to add to a topic's stamps where its clock is far from most others', whole seconds."""
-    late = {n: float(np.median((u.recorded.received[u.rows] - u.ns) / 1e9)) for n, u in usable.items()}
-    usual = float(np.median(list(late.values()))) if late else 0.0
-    nearest = min(late.values(), key=lambda x: abs(x - usual), default=0.0)
-    return {n: round(x - nearest) * 10**9 for n, x in late.items() if abs(x - nearest) > CLOCKS_APART}
-
-
-def _shifted(topic: str, shifts: Mapping[str, int]) -> tuple[str, ...]:
-    if topic not in shifts:
-        return ()
-    return (
-        f"{topic}: its clock is {-shifts[topic] / 1e9:+.0f} s from the others', by when messages arrived; its stamps were "
-        "moved by so many whole seconds, and its clock offset is what remains",
-    )
 
 
 def _names(topics: list[str]) -> dict[str, str]:
@@ -177,5 +126,3 @@ def _reference(bag: Bag, frame_of: Mapping[str, str], streams: Mapping[str, Stre
 def _rate(recorded: Recorded) -> float:
     received = recorded.received
     return 1e9 * (len(received) - 1) / max(int(received[-1] - received[0]), 1) if len(received) > 1 else float("nan")
-
-

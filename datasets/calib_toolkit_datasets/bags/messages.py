@@ -32,7 +32,9 @@ def decode(data: bytes, kind: str, encoding: str, where: str) -> Any:
     try:
         return store.deserialize_ros1(data, kind) if encoding == "ros1" else store.deserialize_cdr(data, kind)
     except (SerdeError, ValueError, IndexError, TypeError, OverflowError, MemoryError, AssertionError) as e:
-        raise DataError(f"{where} is not a whole {short(kind)} ({' '.join(str(e).split())[:120]}); leave it out") from e
+        raise DataError(
+            f"{where} is not a whole {short(kind)} ({' '.join(str(e).split())[:120]}); leave it out"
+        ) from e
 
 
 def encode(message: Any, encoding: str) -> bytes:

@@ -3,15 +3,15 @@
 from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_toolkit import CameraIntrinsics, LazyReadings, tables
 from calib_toolkit.errors import DataError
 from calib_toolkit_datasets.bags import alone, clouds, images, messages, poses
-from calib_toolkit_datasets.bags.index import Bag, Key, Recorded
+from calib_toolkit_datasets.bags.clocks import Usable
+from calib_toolkit_datasets.bags.index import Bag, Key
 
 INFO = "sensor_msgs/msg/CameraInfo"
 KINDS = {
@@ -31,17 +31,9 @@ IMU_GAP = 200_000_000
 """Nanoseconds between Imu messages between which no attitude is told."""
 
 
-class Usable(Protocol):
-    """Messages of a topic that have a stamp."""
-
-    recorded: Recorded
-    rows: NDArray[np.int64]
-    ns: tables.Nanoseconds
-
-
 @dataclass(frozen=True)
 class Made:
-    """What becomes a stream. topics: that it is made of. frame: of its messages. clock: topic whose stamps it shares."""
+    """What becomes a stream. topics: it is made of. frame: of its messages. clock: topic whose stamps it shares."""
 
     kind: str
     ns: tables.Nanoseconds
@@ -55,7 +47,7 @@ class Made:
 
 
 def streams(bag: Bag, usable: Mapping[str, Usable], why: MutableMapping[str, str]) -> dict[str, Made]:
-    """Streams by topic, lidars first, then cameras, then what tells poses. why: says of the others what keeps them."""
+    """Streams by topic: lidars, cameras, then what tells poses. why: is told what keeps the other topics."""
     reader = _Reader(bag, usable, why)
     made: dict[str, Made] = {}
     for topic in reader.of(clouds.KIND):
@@ -124,7 +116,8 @@ class _Reader:
         shift = 0
         if channel.type == images.RAW:
             shift = images.told_shift(keys[len(keys) // 2], source, topic, channel.encoding)
-        info, intrinsics, notes = self.info(topic, frame), None, ()
+        info, intrinsics = self.info(topic, frame), None
+        notes: tuple[str, ...] = ()
         if info:
             rectified = "rect" in topic.removesuffix("/compressed").rpartition("/")[2]
             intrinsics, why = images.intrinsics(self.message(info, 0), rectified)
@@ -195,11 +188,14 @@ class _Reader:
         places = [poses.place_of(read[r], messages.place(keys[r], source, topic)) for r in rows]
         stamps = tables.seconds(u.ns[rows], int(u.ns[rows[0]]))
         fixes = alone.with_course(stamps, places, USUAL_GNSS)
-        notes.append(f"{topic} tells no attitude: the course over ground stands in for it, with its sigma")
+        notes.append(
+            f"{topic} tells no attitude: the course over ground stands in for it, which is that of the vehicle above the "
+            "rear axle only; elsewhere a metre ahead of it is taken for as much of clock offset as it takes to go a metre"
+        )
         return Made("gps_ins", u.ns[rows], fixes, (topic,), read[0].header.frame_id, notes=tuple(notes))
 
     def imu(self, topic: str, frame: str) -> str:
-        """The Imu topic that tells the attitude of a receiver: in its namespace, else of its frame, else the only one."""
+        """The Imu that tells a receiver's attitude: in its namespace, else of its frame, else the only one."""
         able = [t for t in self.of(poses.IMU) if poses.has_orientation(self.message(t, 0))]
         near = topic.rpartition("/")[0]
         same = [t for t in able if t.rpartition("/")[0] == near and near]
@@ -215,9 +211,10 @@ class _Reader:
         rates = np.array([[m.angular_velocity.x, m.angular_velocity.y, m.angular_velocity.z] for m in read])
         if not np.isfinite(rates).all() or read[0].angular_velocity_covariance[0] == -1 or not np.any(rates):
             raise DataError("it holds no turn rates")
-        rows, readings, bias = alone.gyro_steps(tables.seconds(u.ns, int(u.ns[0])), rates)
+        shakes = np.array([[m.linear_acceleration.x, m.linear_acceleration.y, m.linear_acceleration.z] for m in read])
+        rows, readings, bias = alone.gyro_steps(tables.seconds(u.ns, int(u.ns[0])), rates, shakes)
         notes = [f"{topic} tells turns alone: where the Imu sits is not determined by it, only how it is turned"]
         if bias is None:
-            notes.append(f"{topic}: the vehicle never stands, so a bias of its turn rates is not taken off")
+            notes.append(f"{topic}: no time of rest was found, so a bias of its turn rates is not taken off")
         frame = read[0].header.frame_id
         return Made("odometry", u.ns[rows], readings, (topic,), frame, has_scale=False, notes=tuple(notes))

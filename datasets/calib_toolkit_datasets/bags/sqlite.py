@@ -16,7 +16,9 @@ _DEFINITIONS = {"ros2msg": False, "ros2idl": True}
 def scan(path: Path, number: int, index: Index, packed: bool) -> None:
     """Find every message of a file, which is the recording's file of that number. Raises Damaged at what stops it."""
     if path.with_name(f"{path.name}-wal").exists():
-        index.notes.append(f"{path.name}: its last messages lie in {path.name}-wal and are not read; close the bag first")
+        index.notes.append(
+            f"{path.name}: its last messages lie in {path.name}-wal and are not read; close the bag first"
+        )
     with _opened(path) as db:
         for table in ("topics", "messages"):
             if db.execute("SELECT type FROM sqlite_master WHERE name = ?", (table,)).fetchone() != ("table",):

@@ -94,8 +94,8 @@ class _Writing:
         ns = self.log.epoch_ns + round(float(stream.stamps[k]) * 1e9)
         if not 0 <= ns < 2**32 * 10**9:
             raise DataError(
-                f"sensor {stream.name}: its stamp {ns / 1e9:.3f} s is none that ROS can write (1970 to 2106); give it "
-                "unix time"
+                f"sensor {stream.name}: its stamp {ns / 1e9:.3f} s is none that ROS can write (1970 to 2106); "
+                "give it unix time"
             )
         try:
             reading = stream.readings[k]

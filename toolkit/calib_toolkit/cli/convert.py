@@ -93,4 +93,4 @@ def _report(log: "Log", written: "Written", dst: Path) -> None:
     read = sum(len(s) for s in log.streams.values())
     parts = ", ".join(f"{name} {written.readings.get(name, 0)}" for name in log.streams)
     total = sum(written.readings.values())
-    click.echo(f"{dst}: {read} readings read, {total} written ({parts}), {read - total} skipped")
+    click.echo(f"{dst / written.inside}: {read} readings read, {total} written ({parts}), {read - total} skipped")

@@ -14,7 +14,9 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("drive", type=click.Path(path_type=Path))
-@click.option("--sensors", metavar="A,B=C,...", help="Sensors to calibrate, all by default; B=C calls C (a name or a topic) B.")
+@click.option(
+    "--sensors", metavar="A,B=C,...", help="Sensors to calibrate, all by default; B=C calls C (a name or a topic) B."
+)
 @click.option("-o", "--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for calibration.json.")
 @click.option("--format", "format_id", metavar="ID", help="Reader to use; without it, the one that knows DRIVE.")
 @click.option("--base", metavar="NAME", help="Sensor whose frame the poses are in; the first that has scale.")

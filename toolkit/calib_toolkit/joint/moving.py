@@ -32,8 +32,8 @@ SLIGHT = 1e-9
 """Least weight of that, in weights of a reading: arithmetic needs some."""
 LEAST_TRAVEL = 6.0
 """Sigma of a base's reading that the base must travel for the direction of a sensor without scale to count."""
-NOTHING = 1e6
-"""Variance of a direction that does not count."""
+NOTHING, ANY = 1e6, 2.0
+"""Variance given to a direction that does not count, and that from which one does not: it may be any."""
 AROUND = 1.0
 """Seconds over which that travel is told: a single reading would choose itself by its noise."""
 BIASED = 0.05
@@ -144,7 +144,8 @@ class _Search:
         self.hold = np.maximum(1 / (LOOSE * np.var(np.diff(self.twists, 3, axis=0), axis=0) + 1e-12), least)
         sigma = np.sqrt(np.median(np.trace(motions[0].cov[:, :3, :3], axis1=1, axis2=2)) / 3 / WIDENED)
         self.far = [
-            np.full(len(m), m.has_scale) | (_travel(base, a, b) > LEAST_TRAVEL * sigma)
+            m.has_scale
+            | ((_travel(base, a, b) > LEAST_TRAVEL * sigma) & (np.einsum("nii->n", m.cov[:, :3, :3]) < ANY))
             for m, (a, b) in zip(motions, spans, strict=True)
         ]
         self.weights = [np.ones(len(m)) for m in motions]

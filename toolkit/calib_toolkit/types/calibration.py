@@ -73,7 +73,7 @@ class Calibration:
         return self.names.index(name)
 
     def renamed(self, names: Mapping[str, str]) -> "Calibration | None":
-        """The same with other names for some sensors, and without those whose names are taken; None if the base's is."""
+        """With other names for some sensors, and without those whose names are taken; None if the base's is."""
         taken = {new for old, new in names.items() if new != old}
         if self.base in taken and self.base not in names:
             return None
