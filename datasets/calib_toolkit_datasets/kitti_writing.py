@@ -148,7 +148,7 @@ def _cameras(cameras: Mapping[str, Stream], reference: Calibration | None, lost:
         assert isinstance(lens, CameraIntrinsics)
         if np.any(np.asarray(lens.distortion)[COEFFICIENTS:]):
             raise DataError(
-                f"sensor {stream.name}: its distortion has {len(lens.distortion)} coefficients, KITTI's 5; leave it out"
+                f"sensor {stream.name}: its distortion has more coefficients than KITTI's 5; leave it out"
             )
         D = np.resize(np.concatenate([lens.distortion, np.zeros(COEFFICIENTS)]), COEFFICIENTS)
         size = lens.size or np.asarray(stream.readings[0]).shape[1::-1]

@@ -17,8 +17,7 @@ NOISE = 0.002
 QUIET = 2.0
 """Seconds of rest from which a bias is told."""
 STILL, SHAKEN = 0.02, 0.06
-"""By which turn rates (radians a second) and accelerations (metres a second squared) vary less at rest. A vehicle that
-goes straight turns as little, but shakes.
+"""By which turn rates (rad/s) and accelerations (m/s^2) vary less at rest; driving straight on shakes.
 """
 LARGEST_BIAS = 0.1
 SLIP = np.radians(2.0)
@@ -38,8 +37,9 @@ def gyro_steps(
 ) -> tuple[NDArray[np.int64], list[MotionReading], Array | None]:
     """Turns integrated from angular rates: rows that are readings, the readings, and the bias that was taken off.
 
-    stamps: (n,) seconds. rates: (n, 3) radians a second; accelerations: (n, 3), zero if not known. Translations say nothing: length one in some
-    direction with a variance of one, to be used without scale. Bias: (3,), None if the vehicle never stood.
+    stamps: (n,) seconds. rates: (n, 3) radians a second; accelerations: (n, 3), zero if not known.
+    Translations say nothing: length one in some direction with a variance of one, to be used without scale.
+    Bias: (3,), None if no time of rest was found.
     """
     bias = _bias(stamps, rates, accelerations)
     rates = rates - (0.0 if bias is None else bias)

@@ -31,6 +31,10 @@ STAMPED = frozenset(
 """Types of messages that are read and begin with a header."""
 
 
+MOST_NOTES = 5
+"""Sentences on damage that are kept; the others are counted."""
+
+
 class Damaged(Exception):
     """A part of a file is not what it must be; the sentence says what, and where."""
 
@@ -106,7 +110,7 @@ class Index:
     def bag(self, source: Source) -> Bag:
         """What was found. Raises DataError if there is no topic."""
         if not self.channels:
-            why = f" ({'; '.join(self.notes)})" if self.notes else ""
+            why = f" ({'; '.join(self.notes[:MOST_NOTES])})" if self.notes else ""
             raise DataError(f"{source.files[0]} holds no topic that could be read{why}; record or copy it again")
         topics = {}
         for name, channel in self.channels.items():
@@ -115,7 +119,9 @@ class Index:
             if name in self.clashes:
                 channel = Channel(name, "messages of several types", "")
             topics[name] = Recorded(channel, rows[:, 0], rows[:, 1], rows[:, 2:])
-        return Bag(source, topics, tuple(self.notes))
+        more = len(self.notes) - MOST_NOTES
+        notes = [*self.notes[:MOST_NOTES], *([f"{more} more parts of it are damaged"] if more > 0 else [])]
+        return Bag(source, topics, tuple(notes))
 
 
 def header_stamp(head: bytes | memoryview, encoding: str) -> int:

@@ -59,8 +59,8 @@ def to_log(path: Path, bag: Bag) -> Log:
     clean = {n: replace(u, ns=u.ns + shifts.get(n, 0)) for n, u in clean.items()}
     made = sensors.streams(bag, clean, why)
     if not made:
-        reasons = "; ".join(f"{name} ({r.channel.type}): {why[name]}" for name, r in list(bag.topics.items())[:20])
-        raise DataError(f"{path} holds no topic that a sensor reads: {reasons}")
+        reasons = [f"{name} ({r.channel.type}): {why[name]}" for name, r in bag.topics.items() if why[name]]
+        raise DataError(f"{path} holds no topic that a sensor reads: {'; '.join([*bag.notes, *reasons][:20])}")
     names = _names(list(made))
     epoch_ns = min(int(m.ns[0]) for m in made.values())
     streams = {}

@@ -189,8 +189,8 @@ class _Reader:
         stamps = tables.seconds(u.ns[rows], int(u.ns[rows[0]]))
         fixes = alone.with_course(stamps, places, USUAL_GNSS)
         notes.append(
-            f"{topic} tells no attitude: the course over ground stands in for it, which is that of the vehicle above the "
-            "rear axle only; elsewhere a metre ahead of it is taken for as much of clock offset as it takes to go a metre"
+            f"{topic} tells no attitude: the course over ground stands in for it, which is the heading above "
+            "the rear axle only: a metre ahead of it looks like a clock offset of the time it takes to go a metre"
         )
         return Made("gps_ins", u.ns[rows], fixes, (topic,), read[0].header.frame_id, notes=tuple(notes))
 

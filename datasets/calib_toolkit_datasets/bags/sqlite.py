@@ -59,7 +59,7 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
             db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST)
             yield db
     except (sqlite3.Error, OverflowError, UnicodeDecodeError) as e:
-        raise Damaged(f"SQLite can not read it ({e})") from e
+        raise Damaged(f"SQLite can not read it ({' '.join(str(e).split())[:120]})") from e
 
 
 def _channels(db: sqlite3.Connection) -> dict[int, Channel]:

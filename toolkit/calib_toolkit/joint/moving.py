@@ -144,8 +144,7 @@ class _Search:
         self.hold = np.maximum(1 / (LOOSE * np.var(np.diff(self.twists, 3, axis=0), axis=0) + 1e-12), least)
         sigma = np.sqrt(np.median(np.trace(motions[0].cov[:, :3, :3], axis1=1, axis2=2)) / 3 / WIDENED)
         self.far = [
-            m.has_scale
-            | ((_travel(base, a, b) > LEAST_TRAVEL * sigma) & (np.einsum("nii->n", m.cov[:, :3, :3]) < ANY))
+            m.has_scale | ((_travel(base, a, b) > LEAST_TRAVEL * sigma) & (np.trace(m.cov[:, :3, :3].T) < ANY))
             for m, (a, b) in zip(motions, spans, strict=True)
         ]
         self.weights = [np.ones(len(m)) for m in motions]
