@@ -135,15 +135,14 @@ def _listed(folder: Path) -> tuple[list[Path], str]:
 
 def _yaml(file: Path) -> Any:
     """Plain YAML: a tag that asks for anything to be made is refused. Raises DataError."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
+    import yaml
 
     try:
         if file.stat().st_size > LONGEST_METADATA:
             raise DataError(
                 f"{file} is larger than any list of topics; remove it to read the files in order of names"
             )
-        return YAML(typ="safe", pure=True).load(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, YAMLError, RecursionError, ArithmeticError) as e:
+        return yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError, RecursionError, ArithmeticError) as e:
         why = " ".join(str(e).split())[:200]
         raise DataError(f"{file} can not be read ({why}); remove it to read the files in order of names") from e
