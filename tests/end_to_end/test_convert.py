@@ -1,0 +1,125 @@
+"""``calib-toolkit convert`` and ``inspect`` of what it wrote; the same calibration from every format."""
+
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from calib_toolkit import Config, calibrate, open_log
+from calib_toolkit.cli import main
+from calib_toolkit.plugins import registry
+from calib_toolkit.progress import Silent
+
+FORMATS = {"rosbag1": "a.bag", "rosbag2": "b", "mcap": "c.mcap", "kitti-raw": "d"}
+POSES = """\
+# stamp x y z qx qy qz qw
+"""
+
+
+def call(*arguments):
+    return CliRunner().invoke(main, list(map(str, arguments)))
+
+
+@pytest.fixture
+def rig(tmp_path):
+    """Two odometries of one small drive."""
+    rows = [
+        f"{1700000000 + k / 10:.9f} {k / 10} {np.sin(k / 20)} 0 0 0 {np.sin(k / 200)} {np.cos(k / 200)}"
+        for k in range(40)
+    ]
+    (tmp_path / "rig").mkdir()
+    (tmp_path / "rig/poses.txt").write_text(POSES + "\n".join(rows) + "\n")
+    table = '[sensors.{}]\nkind = "odometry"\nposes = "poses.txt"\nformat = "tum"\n'
+    (tmp_path / "rig/rig.toml").write_text(table.format("a") + table.format("b"))
+    return tmp_path / "rig"
+
+
+def test_what_was_read_written_and_skipped_is_counted(rig, tmp_path):
+    done = call("convert", rig, tmp_path / "a.bag", "--to", "rosbag1")
+    assert done.exit_code == 0, done.output
+    assert done.output.splitlines()[-1].endswith("80 readings read, 80 written (a 40, b 40), 0 skipped")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.bag", "rig"]
+
+
+def test_topics_are_shown_and_named(rig, tmp_path):
+    call("convert", rig, tmp_path / "a.bag", "--to", "rosbag1", "--sensors", "lidar=a,b")
+    seen = call("inspect", tmp_path / "a.bag").output
+    assert "nav_msgs/Odometry" in seen
+    assert "--sensors b=/b/odom,lidar=/lidar/odom" in seen
+    log = open_log(tmp_path / "a.bag").select(["one=/lidar/odom", "two=b"])
+    assert list(log.streams) == ["one", "two"]
+    assert [s.clock for s in log.streams.values()] == ["one", "two"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--to", "betamax"], "no plugin writes that; there are:"),
+        (["--to", "rosbag1", "--sensors", "z"], "no sensor named 'z'"),
+        (["--to", "kitti-raw"], "no sensor that KITTI raw has a place for"),
+    ],
+)
+def test_refusals_leave_nothing(rig, tmp_path, arguments, said):
+    done = call("convert", rig, tmp_path / "x", *arguments)
+    assert done.exit_code == 1
+    assert said in done.output
+    assert [p.name for p in tmp_path.iterdir()] == ["rig"]
+
+
+def test_what_is_there_is_not_overwritten(rig, tmp_path):
+    (tmp_path / "a.bag").write_text("mine")
+    done = call("convert", rig, tmp_path / "a.bag", "--to", "rosbag1")
+    assert (done.exit_code, (tmp_path / "a.bag").read_text()) == (1, "mine")
+
+
+def test_a_killed_conversion_leaves_nothing_that_looks_whole(rig, tmp_path):
+    slow = tmp_path / "slow.py"
+    slow.write_text(
+        "import time\nfrom calib_toolkit import Dataset, Written, hookimpl\n"
+        "def write(log, path, progress):\n    path.write_text('half')\n    time.sleep(60)\n    return Written({})\n"
+        "@hookimpl\ndef calib_register_datasets():\n"
+        "    return [Dataset('slow', 'nothing', lambda p: False, None, write)]\n"
+    )
+    command = [Path(sys.executable).with_name("calib-toolkit"), "convert", rig, tmp_path / "x", "--to", "slow"]
+    process = subprocess.Popen([*command, "--plugin", slow], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while not (tmp_path / ".x.part/x").exists():
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not (tmp_path / "x").exists()
+    done = call("convert", rig, tmp_path / "x", "--to", "rosbag2")
+    assert done.exit_code == 0
+    assert not (tmp_path / ".x.part").exists()
+
+
+@pytest.mark.long
+def test_the_same_calibration_from_every_format(tmp_path):
+    drive = tmp_path / "drive"
+    made = call("simulate", drive, "--rig", "compact", "--seconds", 12, "--seed", 3, "--jobs", 1)
+    assert made.exit_code == 0, made.output
+    config, plugins = Config(jobs=1, appearance=()), registry()
+    log = open_log(drive)
+    # KITTI has one sigma for all axes of a position and none for angles
+    ins = log.streams["ins"]
+    fixes = [replace(f, sigma_position=np.full(3, 0.03), sigma_rpy=None) for f in ins.readings]
+    log = replace(log, streams={**log.streams, "ins": replace(ins, readings=fixes)})
+    wanted = calibrate(log, config, plugins, cache_folder=tmp_path / "cache").calibration
+    for target, name in FORMATS.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        writer = plugins.datasets[target].write
+        done = writer(log, tmp_path / name, Silent())
+        assert dict(done.readings) == {n: len(s) for n, s in log.streams.items()}
+        again = open_log(tmp_path / name / done.inside)
+        found = calibrate(
+            again.select(list(log.streams)), config, plugins, cache_folder=tmp_path / "cache"
+        ).calibration
+        np.testing.assert_allclose(found.T_base_sensor, wanted.T_base_sensor, atol=1e-5, err_msg=target)
+        np.testing.assert_allclose(found.dt_base_sensor, wanted.dt_base_sensor, atol=1e-6, err_msg=target)
+        np.testing.assert_allclose(found.sigma, wanted.sigma, rtol=1e-3, err_msg=target)
