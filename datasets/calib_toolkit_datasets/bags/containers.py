@@ -1,7 +1,6 @@
 """Recordings of each kind: which files belong to one, all messages in them, and the bytes of one message."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -61,13 +60,13 @@ def open_bag2(path: Path) -> Bag:
     present = sorted((p for p in path.iterdir() if p.suffix in SUFFIXES), key=lambda p: (len(p.name), p.name))
     if not (path / METADATA).is_file():
         note = f"{path} has no {METADATA}, as if its recording was killed; its files are read in the order of names"
-        return _found(_source(path, present, ""), (note,))
-    files, mode = _listed(path)
+        return _found(_source(path, present), (note,))
+    files = _listed(path)
     missing = [f.name for f in files if not f.is_file()]
     if missing:
         raise DataError(f"{path / METADATA} lists {missing[0]}, which is missing; copy the whole folder")
     notes = [f"{path.name}: {p.name} is not in its {METADATA} and is left out" for p in present if p not in files]
-    return _found(_source(path, files, mode), tuple(notes))
+    return _found(_source(path, files), tuple(notes))
 
 
 def fetch(source: Source, key: Key) -> bytes:
@@ -82,14 +81,12 @@ def fetch(source: Source, key: Key) -> bytes:
 _FETCH: dict[str, Callable[[Path, Key], bytes]] = {
     "bag1": bag1.fetch,
     "mcap": mcap.fetch,
-    "sqlite": partial(sqlite.fetch, packed=False),
-    "sqlite-zstd": partial(sqlite.fetch, packed=True),
+    "sqlite": sqlite.fetch,
 }
 _SCAN: dict[str, Callable[[Path, int, Index], None]] = {
     "bag1": bag1.scan,
     "mcap": mcap.scan,
-    "sqlite": partial(sqlite.scan, packed=False),
-    "sqlite-zstd": partial(sqlite.scan, packed=True),
+    "sqlite": sqlite.scan,
 }
 
 
@@ -105,17 +102,17 @@ def _found(source: Source, notes: Sequence[str]) -> Bag:
     return index.bag(source)
 
 
-def _source(folder: Path, files: Sequence[Path], mode: str) -> Source:
+def _source(folder: Path, files: Sequence[Path]) -> Source:
     kinds = {f.suffix for f in files}
     if len(kinds) != 1:
         raise DataError(f"{folder} must hold files of one kind, {' or '.join(SUFFIXES)}; name one file, or sort them")
     if kinds == {".mcap"}:
         return Source(tuple(files), "mcap")
-    return Source(tuple(files), "sqlite-zstd" if mode == "message" else "sqlite")
+    return Source(tuple(files), "sqlite")
 
 
-def _listed(folder: Path) -> tuple[list[Path], str]:
-    """Files that a metadata.yaml lists, none outside its folder, and the mode of compression."""
+def _listed(folder: Path) -> list[Path]:
+    """Files that a metadata.yaml lists, none outside its folder."""
     file = folder / METADATA
     try:
         content = _yaml(file)["rosbag2_bagfile_information"]
@@ -130,7 +127,7 @@ def _listed(folder: Path) -> tuple[list[Path], str]:
         raise DataError(f"{file} lists no files; remove it to read those that are there")
     if mode.lower() == "file":
         raise DataError(f"{folder} is compressed file by file; unpack {names[0]} with zstd -d, and remove {METADATA}")
-    return [folder / n for n in names], mode.lower()
+    return [folder / n for n in names]
 
 
 def _yaml(file: Path) -> Any:

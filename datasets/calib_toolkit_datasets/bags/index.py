@@ -68,7 +68,7 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Source:
-    """The files of a recording, and how they are read: ``bag1``, ``mcap``, ``sqlite`` or ``sqlite-zstd``."""
+    """The files of a recording, and how they are read: ``bag1``, ``mcap`` or ``sqlite``."""
 
     files: tuple[Path, ...]
     storage: str

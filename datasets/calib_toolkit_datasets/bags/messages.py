@@ -20,7 +20,7 @@ def load(key: Key, source: Source, topic: str, kind: str, encoding: str) -> Any:
 
 def place(key: Key, source: Source, topic: str) -> str:
     """File, topic and message, as sentences begin with them."""
-    where = f"message {key[2]}" if source.storage.startswith("sqlite") else f"the message at byte {key[1] or key[2]}"
+    where = f"message {key[2]}" if source.storage == "sqlite" else f"the message at byte {key[1] or key[2]}"
     return f"{source.files[key[0]]}: {topic}: {where}"
 
 

@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
 POSE_COV = "geometry_msgs/msg/PoseWithCovarianceStamped"
 FIX, IMU = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
+LAST_PLACE = np.array([90.0, 360.0, 1e5])
+"""Degrees, degrees and metres: nothing on earth is beyond."""
 UNIT = 0.01
 """How far from one the length of a quaternion may be."""
 
@@ -75,7 +77,7 @@ def load_fix(key: FixKey, source: Source, topics: tuple[str, str], encodings: tu
 def place_of(message: Any, where: str) -> Fix:
     """The position of a NavSatFix, its attitude zero. Raises DataError for what is no place on earth."""
     at = np.array([message.latitude, message.longitude, message.altitude])
-    if not np.isfinite(at).all() or abs(at[0]) > 90 or abs(at[1]) > 360:
+    if not np.isfinite(at).all() or np.any(np.abs(at) > LAST_PLACE):
         raise DataError(f"{where} holds no place on earth ({', '.join(map(str, at))}); leave it out")
     variance = np.diag(np.array(message.position_covariance, dtype=float).reshape(3, 3))
     stated = message.position_covariance_type and np.all(np.isfinite(variance) & (variance > 0))

@@ -1,4 +1,4 @@
-"""ROS 2 bags that SQLite stores (``.db3``), as they are or with each message compressed by zstd."""
+"""ROS 2 bags that SQLite stores (``.db3``), their messages as they are or compressed by zstd."""
 
 import sqlite3
 from collections.abc import Iterator
@@ -10,10 +10,12 @@ from calib_toolkit_datasets.bags.index import HEAD, LARGEST, Channel, Damaged, I
 from calib_toolkit_datasets.bags.packing import zstd
 
 MAGIC = b"SQLite format 3\0"
+PACKED = b"\x28\xb5\x2f\xfd"
+"""How what zstd made begins; CDR begins with a zero."""
 _DEFINITIONS = {"ros2msg": False, "ros2idl": True}
 
 
-def scan(path: Path, number: int, index: Index, packed: bool) -> None:
+def scan(path: Path, number: int, index: Index) -> None:
     """Find every message of a file, which is the recording's file of that number. Raises Damaged at what stops it."""
     if path.with_name(f"{path.name}-wal").exists():
         index.notes.append(
@@ -31,22 +33,17 @@ def scan(path: Path, number: int, index: Index, packed: bool) -> None:
                 raise Damaged(f"its message {row} has no topic, no time or no data")
             if size > LARGEST:
                 raise Damaged(f"its message {row} has {size} bytes, more than any message")
-            head = fetch(path, (number, 0, row, size), packed)[:HEAD] if packed else _head(db, row, size)
+            head = _head(db, row, size)
+            if head.startswith(PACKED):
+                head = _unpacked(_data(db, row), row)[:HEAD]
             index.add(channels[topic], max(received, 0), head, (number, 0, row, size))
 
 
-def fetch(path: Path, key: Key, packed: bool) -> bytes:
+def fetch(path: Path, key: Key) -> bytes:
     """The bytes of one message. Raises Damaged."""
     with _opened(path) as db:
-        found = db.execute("SELECT data FROM messages WHERE id = ?", (key[2],)).fetchone()
-    if found is None or not isinstance(found[0], bytes):
-        raise Damaged(f"its message {key[2]} holds no data")
-    if not packed:
-        return bytes(found[0])
-    try:
-        return bytes(zstd().ZstdDecompressor().decompress(found[0], max_length=LARGEST))
-    except (zstd().ZstdError, EOFError, MemoryError) as e:
-        raise Damaged(f"its message {key[2]} can not be unpacked ({e})") from e
+        data = _data(db, key[2])
+    return _unpacked(data, key[2]) if data.startswith(PACKED) else data
 
 
 @contextmanager
@@ -76,6 +73,20 @@ def _channels(db: sqlite3.Connection) -> dict[int, Channel]:
             str(topic), str(kind), str(encoding), text if known else "", _DEFINITIONS.get(style, False)
         )
     return channels
+
+
+def _data(db: sqlite3.Connection, row: int) -> bytes:
+    found = db.execute("SELECT data FROM messages WHERE id = ?", (row,)).fetchone()
+    if found is None or not isinstance(found[0], bytes):
+        raise Damaged(f"its message {row} holds no data")
+    return bytes(found[0])
+
+
+def _unpacked(data: bytes, row: int) -> bytes:
+    try:
+        return bytes(zstd().ZstdDecompressor().decompress(data, max_length=LARGEST))
+    except (zstd().ZstdError, EOFError, MemoryError) as e:
+        raise Damaged(f"its message {row} can not be unpacked ({e})") from e
 
 
 def _head(db: sqlite3.Connection, row: int, size: int) -> bytes:
