@@ -21,7 +21,7 @@ BLOCK = 2**20
 
 
 def main() -> None:
-    """Convert, then read each; files are in the system's cache and processor seconds count, so that no disk is measured."""
+    """Convert, then read each; processor seconds, the files being in the system's cache: no disk is measured."""
     drive = Path(sys.argv[1])
     folder = Path(sys.argv[2] if len(sys.argv) > 2 else tempfile.mkdtemp())
     print("format      MB  convert s  peak MB    plain s   open s   read s  read/plain")

@@ -90,6 +90,8 @@ def _other(channel: Channel) -> str:
     standard = _fields(types(channel.encoding).fielddefs[channel.type][1])
     if own == standard and list(own) == list(standard):
         return ""
+    if not own:
+        return "its definition holds no fields"
     odd = [n for n in standard if own.get(n) != standard[n]] or [n for n in own if n not in standard]
     return f"its definition differs from ROS's own in the field '{(odd or [*standard])[0]}'"
 

@@ -27,9 +27,9 @@ def unpack(data: bytes, compression: str, size: int) -> bytes:
     else:
         try:
             whole = _unpacker(compression).decompress(data, max_length=size + 1) if size else b""
-        except (OSError, ValueError, EOFError, RuntimeError, MemoryError) as e:
-            raise Damaged(f"a chunk of {compression} can not be unpacked ({e})") from e
-        except Exception as e:  # each library has an error of its own
+        except Damaged:
+            raise
+        except Exception as e:  # each library has errors of its own
             raise Damaged(f"a chunk of {compression} can not be unpacked ({type(e).__name__}: {e})") from e
     if len(whole) != size:
         raise Damaged(f"a chunk holds {len(whole)} bytes or more where it says {size}")
