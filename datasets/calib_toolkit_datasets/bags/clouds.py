@@ -26,6 +26,9 @@ SWEEP = (0.2, 1.5)
 APART = 1.0
 """Seconds from the stamp beyond which points' times are of another clock."""
 
+ANY_NUMBER = np.errstate(over="ignore", invalid="ignore")
+"""What is too large becomes infinite, and what is not finite is dropped."""
+
 
 @dataclass(frozen=True)
 class Timing:
@@ -38,6 +41,7 @@ class Timing:
     since: str
 
 
+@ANY_NUMBER
 def load_scan(key: Key, source: Source, topic: str, encoding: str, timing: Timing | None) -> Scan:
     """One sweep without its points that are not numbers. Raises DataError, naming file, topic and place."""
     where = place(key, source, topic)
@@ -57,6 +61,7 @@ def load_scan(key: Key, source: Source, topic: str, encoding: str, timing: Timin
     )
 
 
+@ANY_NUMBER
 def told_timing(key: Key, source: Source, topic: str, encoding: str, period: float) -> tuple[Timing | None, str]:
     """How a driver tells the time of points, and a sentence where that is odd or missing; from one of its sweeps.
 
@@ -151,7 +156,9 @@ def _times(columns: dict[str, NDArray[Any]], timing: Timing, message: Any, where
     if timing.field not in columns:
         raise DataError(f"{where}: its points have no field '{timing.field}' as others of this topic; leave it out")
     times = _stamps(columns[timing.field], timing, message)
-    return np.asarray(times - np.nanmin(times) if timing.since == "first" else times, dtype=np.float32)
+    if timing.since == "first":
+        times = times - np.min(times, initial=np.inf, where=np.isfinite(times))
+    return times.astype(np.float32)
 
 
 def _stamps(raw: NDArray[Any], timing: Timing, message: Any) -> Array:

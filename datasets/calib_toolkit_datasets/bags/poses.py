@@ -19,6 +19,8 @@ POSE_COV = "geometry_msgs/msg/PoseWithCovarianceStamped"
 FIX, IMU = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
 LAST_PLACE = np.array([90.0, 360.0, 1e5])
 """Degrees, degrees and metres: nothing on earth is beyond."""
+HUGE = 1e9
+"""Metres, and their squares: no pose and no covariance is beyond."""
 UNIT = 0.01
 """How far from one the length of a quaternion may be."""
 
@@ -42,8 +44,8 @@ def load_pose(key: Key, source: Source, topic: str, kind: str, encoding: str, st
     pose = message.pose if kind == POSE else message.pose.pose
     R = rotation(pose.orientation, where).as_matrix()
     T = se3.rigid(R, np.array([pose.position.x, pose.position.y, pose.position.z]))
-    if not np.isfinite(T).all():
-        raise DataError(f"{where} holds a pose that is not finite; leave it out")
+    if not np.all(np.abs(T) < HUGE):
+        raise DataError(f"{where} holds a pose that is nowhere; leave it out")
     return PoseReading(T, np.array(message.pose.covariance, dtype=float).reshape(6, 6) if stated else None)
 
 
@@ -55,7 +57,7 @@ def covariance_is_usable(first: Any, last: Any) -> bool:
     sizes = []
     for message in (first, last):
         cov = np.array(message.pose.covariance, dtype=float).reshape(6, 6)
-        if not np.isfinite(cov).all() or not np.allclose(cov, cov.T) or np.linalg.eigvalsh(cov)[0] <= 0:
+        if not np.all(np.abs(cov) < HUGE) or not np.allclose(cov, cov.T) or np.linalg.eigvalsh(cov)[0] <= 0:
             return False
         sizes.append(np.array([np.trace(cov[:3, :3]), np.trace(cov[3:, 3:])]))
     return bool(np.all(sizes[1] < 4 * sizes[0]))
@@ -88,17 +90,21 @@ def place_of(message: Any, where: str) -> Fix:
 def has_orientation(message: Any) -> bool:
     """Whether an Imu message holds an attitude: ROS marks one that does not by a covariance of -1."""
     q = message.orientation
-    length = np.linalg.norm([q.x, q.y, q.z, q.w])
     level = (q.x, q.y, q.z, q.w) == (0.0, 0.0, 0.0, 1.0)  # what drivers without attitude leave
-    return bool(message.orientation_covariance[0] != -1 and abs(length - 1) < UNIT and not level)
+    return bool(message.orientation_covariance[0] != -1 and _unit(q) and not level)
 
 
 def rotation(q: Any, where: str) -> Rotation:
     """Of a quaternion of length one. Raises DataError; the sentence begins with ``where``."""
     parts = [q.x, q.y, q.z, q.w]
-    if not abs(np.linalg.norm(parts) - 1) < UNIT:
+    if not _unit(q):
         raise DataError(f"{where} holds a quaternion that is not of length one; leave it out")
     return Rotation.from_quat(parts)
+
+
+def _unit(q: Any) -> bool:
+    parts = np.array([q.x, q.y, q.z, q.w])
+    return bool(np.all(np.abs(parts) < 2) and abs(np.linalg.norm(parts) - 1) < UNIT)
 
 
 def between(received: NDArray[np.int64], wanted: NDArray[np.int64]) -> tuple[NDArray[np.int64], Array]:

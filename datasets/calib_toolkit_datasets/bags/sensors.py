@@ -27,6 +27,8 @@ KINDS = {
 """Sensor that reads each type of message."""
 USUAL_GNSS = 2.0
 """Sigma of a position that states none, metres."""
+FASTEST, LARGEST_SHAKE = 100.0, 1e4
+"""Radians a second, metres a second squared: what is beyond is no measurement."""
 IMU_GAP = 200_000_000
 """Nanoseconds between Imu messages between which no attitude is told."""
 
@@ -209,9 +211,10 @@ class _Reader:
             raise DataError("it has too few messages")
         read = [messages.load(k, source, topic, poses.IMU, encoding) for k in self.keys(topic)]
         rates = np.array([[m.angular_velocity.x, m.angular_velocity.y, m.angular_velocity.z] for m in read])
-        if not np.isfinite(rates).all() or read[0].angular_velocity_covariance[0] == -1 or not np.any(rates):
-            raise DataError("it holds no turn rates")
+        if not np.all(np.abs(rates) < FASTEST) or read[0].angular_velocity_covariance[0] == -1 or not np.any(rates):
+            raise DataError(f"it holds no turn rates, or some beyond {FASTEST:g} rad/s")
         shakes = np.array([[m.linear_acceleration.x, m.linear_acceleration.y, m.linear_acceleration.z] for m in read])
+        shakes = np.where(np.abs(shakes) < LARGEST_SHAKE, shakes, 0.0)
         rows, readings, bias = alone.gyro_steps(tables.seconds(u.ns, int(u.ns[0])), rates, shakes)
         notes = [f"{topic} tells turns alone: where the Imu sits is not determined by it, only how it is turned"]
         if bias is None:
