@@ -245,25 +245,24 @@ def test_a_fix_takes_its_attitude_from_the_imu_around_it(tmp_path):
 
 
 def test_messages_without_a_fix_are_left_out(tmp_path):
-    m = Messages("cdr")
-    rows = [
-        ("/fix", START + k * SWEEP, m.fix(START + k * SWEEP, 49 + 1e-5 * k, 8, 0, status=-(k == 2))) for k in range(5)
-    ]
+    m, rows = Messages("cdr"), []
+    for k in range(5):
+        ns = START + k * SWEEP
+        rows.append(("/fix", ns, m.fix(ns, 49 + 1e-5 * k, 8, 0, status=-(k == 2))))
+        rows.append(("/imu", ns, m.imu(ns, quaternion=(0.0, 0.0, 0.6, 0.8))))
     stream = opened(write(tmp_path / "a", "sqlite", rows)).streams["fix"]
     assert len(stream) == 4
     assert "1 of 5 messages have no fix" in stream.notes[0]
-    assert "tells no attitude" in stream.notes[1]
 
 
-def test_the_course_is_the_heading_and_says_how_sure_it_is(tmp_path):
-    m, rows = Messages("cdr"), []
-    for k in range(60):
-        ns, gone = START + k * SWEEP, max(k - 30, 0)
-        rows.append(("/fix", ns, m.fix(ns, 49.0 + 1e-5 * gone, 8.4, 110.0)))
-    fixes = opened(write(tmp_path / "a", "sqlite", rows)).streams["fix"].readings
-    assert fixes[50].yaw == pytest.approx(np.pi / 2, abs=1e-6)  # north
-    assert fixes[50].sigma_rpy[2] < 0.05
-    assert fixes[5].sigma_rpy[2] == pytest.approx(np.pi)  # it stands
+def test_positions_alone_are_no_sensor_and_the_reason_is_said(tmp_path):
+    m = Messages("cdr")
+    rows = [("/fix", START + k * SWEEP, m.fix(START + k * SWEEP, 49.0 + 1e-5 * k, 8.4, 110.0)) for k in range(5)]
+    rows += [("/odom", START + k * SWEEP, m.pose(START + k * SWEEP, (k, 0, 0))) for k in range(5)]
+    log = opened(write(tmp_path / "a", "sqlite", rows))
+    assert set(log.streams) == {"odom"}
+    (fix,) = (t for t in log.topics if t.name == "/fix")
+    assert "positions alone tell neither attitude nor turns" in fix.unused
 
 
 def test_an_imu_alone_turns_and_does_not_travel(tmp_path):

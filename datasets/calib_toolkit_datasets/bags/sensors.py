@@ -9,7 +9,7 @@ import numpy as np
 
 from calib_toolkit import CameraIntrinsics, LazyReadings, tables
 from calib_toolkit.errors import DataError
-from calib_toolkit_datasets.bags import alone, clouds, images, messages, poses
+from calib_toolkit_datasets.bags import clouds, gyro, images, messages, poses
 from calib_toolkit_datasets.bags.clocks import Usable
 from calib_toolkit_datasets.bags.index import Bag, Key
 
@@ -25,8 +25,6 @@ KINDS = {
     poses.IMU: "odometry",
 }
 """Sensor that reads each type of message."""
-USUAL_GNSS = 2.0
-"""Sigma of a position that states none, metres."""
 FASTEST, LARGEST_SHAKE = 100.0, 1e4
 """Radians a second, metres a second squared: what is beyond is no measurement."""
 IMU_GAP = 200_000_000
@@ -160,7 +158,7 @@ class _Reader:
         return Made("odometry", u.ns, LazyReadings(load, keys), (topic,), frame)
 
     def gnss(self, topic: str) -> Made:
-        """A GPS/INS where an Imu of its frame or namespace tells attitude, else positions with their course."""
+        """A GPS/INS, where an Imu of its frame or namespace tells attitude."""
         u, source = self.usable[topic], self.bag.source
         keys, encoding = self.keys(topic), u.recorded.channel.encoding
         read = [messages.load(k, source, topic, poses.FIX, encoding) for k in keys]
@@ -187,14 +185,9 @@ class _Reader:
             ns = u.ns[rows[there]]
             if len(ns) > 1:
                 return Made("gps_ins", ns, LazyReadings(load, found), (topic, imu), frame, notes=tuple(notes))
-        places = [poses.place_of(read[r], messages.place(keys[r], source, topic)) for r in rows]
-        stamps = tables.seconds(u.ns[rows], int(u.ns[rows[0]]))
-        fixes = alone.with_course(stamps, places, USUAL_GNSS)
-        notes.append(
-            f"{topic} tells no attitude: the course over ground stands in for it, which is the heading above "
-            "the rear axle only: a metre ahead of it looks like a clock offset of the time it takes to go a metre"
+        raise DataError(
+            "positions alone tell neither attitude nor turns; record an Imu with orientation or an odometry, too"
         )
-        return Made("gps_ins", u.ns[rows], fixes, (topic,), read[0].header.frame_id, notes=tuple(notes))
 
     def imu(self, topic: str, frame: str) -> str:
         """The Imu that tells a receiver's attitude: in its namespace, else of its frame, else the only one."""
@@ -215,7 +208,7 @@ class _Reader:
             raise DataError(f"it holds no turn rates, or some beyond {FASTEST:g} rad/s")
         shakes = np.array([[m.linear_acceleration.x, m.linear_acceleration.y, m.linear_acceleration.z] for m in read])
         shakes = np.where(np.abs(shakes) < LARGEST_SHAKE, shakes, 0.0)
-        rows, readings, bias = alone.gyro_steps(tables.seconds(u.ns, int(u.ns[0])), rates, shakes)
+        rows, readings, bias = gyro.gyro_steps(tables.seconds(u.ns, int(u.ns[0])), rates, shakes)
         notes = [f"{topic} tells turns alone: where the Imu sits is not determined by it, only how it is turned"]
         if bias is None:
             notes.append(f"{topic}: no time of rest was found, so a bias of its turn rates is not taken off")
