@@ -367,7 +367,7 @@ def folders(recordings, tmp_path_factory):
 
 
 def test_the_recordings_become_folders_with_a_truth(folders):
-    assert sorted(f.name for f in folders.iterdir()) == ["kitti", "kitti-ins", "ladybug", "shrimp"]
+    assert sorted(f.name for f in folders.iterdir()) == ["kitti", "kitti-ins", "kitti-kiss", "ladybug", "shrimp"]
     log = open_log(folders / "kitti")
     c = log.reference
     np.testing.assert_allclose([c.dt_between("cam0", f"cam{k}")[0] for k in range(4)], [0, 0, 6.14e-3, 6.70e-3])

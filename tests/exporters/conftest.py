@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rigs import Exporting
+from exported_rigs import Exporting
 
 from calib_toolkit import CameraIntrinsics
 from calib_toolkit.plugins import registry

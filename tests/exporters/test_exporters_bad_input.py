@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 import yaml
-from rigs import FORMATS, make_rig, ordinary
+from exported_rigs import FORMATS, make_rig, ordinary
 
 from calib_toolkit import DataError
 

@@ -4,7 +4,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from rigs import FORMATS, ordinary, same
+from exported_rigs import FORMATS, ordinary, same
 
 from calib_toolkit import CalibrationError
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rigs import FORMATS, make_rig
+from exported_rigs import FORMATS, make_rig
 from scipy.spatial.transform import Rotation
 
 from calib_toolkit import se3

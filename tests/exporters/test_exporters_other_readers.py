@@ -9,9 +9,9 @@ import numpy as np
 import pykitti
 import pytest
 import yaml
+from exported_rigs import make_rig, ordinary
 from pytransform3d.transformations import transform_from_pq
 from pytransform3d.urdf import UrdfTransformManager
-from rigs import make_rig, ordinary
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calib_toolkit import CameraIntrinsics, se3

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from exported_rigs import ENDING, FORMATS, SENSORS, make_rig, ordinary, same
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
-from rigs import ENDING, FORMATS, SENSORS, make_rig, ordinary, same
 
 from calib_toolkit import CameraIntrinsics, DataError, se3
 
