@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO
 
 from calib_toolkit_datasets.bags.index import HEAD, Channel, Damaged, Index, Key
-from calib_toolkit_datasets.bags.packing import read, size_of, unpack
+from calib_toolkit_datasets.bags.packing import message, read, size_of, unpack
 
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG, CHUNK, CONNECTION = 2, 3, 5, 7
@@ -46,12 +46,7 @@ def scan(path: Path, number: int, index: Index) -> None:
 
 def fetch(path: Path, key: Key) -> bytes:
     """The bytes of one message. Raises Damaged or OSError."""
-    _, chunk, start, length = key
-    if chunk:
-        return _chunk(path, chunk)[start : start + length]
-    with path.open("rb") as file:
-        file.seek(start)
-        return read(file, length, size_of(path) - start)
+    return message(path, key, _chunk)
 
 
 @lru_cache(maxsize=2)

@@ -1,9 +1,10 @@
 """Compressed chunks, unpacked to no more than they say they hold."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
-from calib_toolkit_datasets.bags.index import LARGEST, Damaged
+from calib_toolkit_datasets.bags.index import LARGEST, Damaged, Key
 
 
 def read(file: IO[bytes], size: int, left: int) -> bytes:
@@ -64,3 +65,13 @@ def zstd() -> Any:
 def size_of(file: Path) -> int:
     """Bytes of a file."""
     return file.stat().st_size
+
+
+def message(path: Path, key: Key, chunk: Callable[[Path, int], bytes]) -> bytes:
+    """The bytes of one message, in a chunk (unpacked by ``chunk``) or in the file. Raises Damaged or OSError."""
+    _, at, start, length = key
+    if at:
+        return chunk(path, at)[start : start + length]
+    with path.open("rb") as file:
+        file.seek(start)
+        return read(file, length, size_of(path) - start)

@@ -9,6 +9,8 @@ import click
 from calib_toolkit.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from calib_toolkit.hookspecs import Dataset, Written
     from calib_toolkit.progress import Progress
     from calib_toolkit.types import Log
@@ -58,15 +60,11 @@ def convert(
         ctx.exit(3)
 
 
-def _writer(datasets: "object", target: str) -> "Dataset":
-    from collections.abc import Mapping
-
-    assert isinstance(datasets, Mapping)
+def _writer(datasets: "Mapping[str, Dataset]", target: str) -> "Dataset":
     able = [d.id for d in datasets.values() if d.write is not None]
     if target not in able:
         raise ConfigError(f"--to {target}: no plugin writes that; there are: {', '.join(able) or 'none'}")
-    chosen: Dataset = datasets[target]
-    return chosen
+    return datasets[target]
 
 
 def _whole(dataset: "Dataset", log: "Log", dst: Path, progress: "Progress") -> "Written":
