@@ -6,6 +6,7 @@ import numpy as np
 from bound import VAGUE, information, null_space
 from numpy.typing import NDArray
 from rigs import AXES, CONSTANT, Outcome, Rig, draw, measured, pulls, solve
+from scipy.spatial.transform import Rotation
 from summaries import mean, table
 
 Array = NDArray[np.float64]
@@ -18,7 +19,7 @@ ASIDE_DEG = 10.0
 """An open direction counts as flagged if it is no further than this from what is flagged."""
 
 
-def draw_failures(rigs: int, first: int, shortest: float, longest: float) -> list[Rig]:
+def draw_failures(rigs: int, first: int, kinds: Sequence[str], shortest: float, longest: float) -> list[Rig]:
     """A lidar that stands upright and an INS, on every kind of drive of so many seconds."""
     counts = {s: max(rigs // len(LENGTHS), 1) for s in LENGTHS} | {HOUR: max(rigs // 10, 1)}
     failing = [(kind, s, count) for kind in KINDS for s, count in counts.items()]
@@ -26,7 +27,7 @@ def draw_failures(rigs: int, first: int, shortest: float, longest: float) -> lis
     return [
         draw(seed, kind, 2, seconds, level=True)
         for kind, seconds, count in (*failing, *normal)
-        if shortest <= seconds <= longest
+        if kind in kinds and shortest <= seconds <= longest
         for seed in range(first, first + count)
     ]
 
@@ -43,6 +44,7 @@ def look(rig: Rig, method: str) -> Outcome:
     told: Outcome = {"drive": rig.drive, "seconds": rig.seconds, "open": len(null), "vague": vague}
     if found["refused"]:
         return found | told | {"flagged": len(AXES), "aside": 0.0, "along": float("nan")}
+    found["error"] = [_nearest(error, null) for error in found["error"]]
     directions = np.array([[d.get(f"{found['names'][0]}.{axis}", 0.0) for axis in AXES] for d in found["flagged"]])
     flagged, unknown = _basis(directions.reshape(-1, len(AXES)) / VAGUE), _basis(null / VAGUE)
     left = unknown - unknown @ flagged.T @ flagged
@@ -112,6 +114,20 @@ def _basis(directions: Array) -> Array:
     """Orthonormal rows that span the same."""
     _, size, rows = np.linalg.svd(directions, full_matrices=False)
     return np.asarray(rows[size > 1e-6])
+
+
+def _nearest(error: Sequence[float], null: Array) -> list[float]:
+    """An error (7,) to the nearest of the poses that are as true, if a turn about some axis is open by itself.
+
+    How far the axes across are off can not be told from a rotation vector of many degrees.
+    """
+    _, share, axes = np.linalg.svd(_basis(null / VAGUE)[:, 3:6])
+    by_itself = axes[: len(share)][share > 1 - 1e-3]
+    if len(by_itself) != 1:
+        return list(error)
+    turn = Rotation.from_rotvec(error[3:6]).as_quat()
+    about = Rotation.from_quat([*(by_itself[0] * (turn[:3] @ by_itself[0])), turn[3]])
+    return [*error[:3], *(about.inv() * Rotation.from_quat(turn)).as_rotvec(), error[6]]
 
 
 def _along(directions: Array, cov: Array) -> float:

@@ -13,7 +13,7 @@ import click
 import numpy as np
 from bound import information, instants, read_together
 from bound import sigma as bound_sigma
-from failures import HOUR, LENGTHS, draw_failures, look, tell_alarms, tell_failures
+from failures import HOUR, KINDS, LENGTHS, NORMAL_KINDS, draw_failures, look, tell_alarms, tell_failures
 from rigs import CAMERAS, NORMAL, PLACES, Outcome, Rig, difference, draw, solve, solve_all
 from scipy.spatial.transform import Rotation
 from summaries import POSE, TURN, tell, tell_bound, tell_coverage, tell_nees, tell_outliers, tell_scale, tell_starts
@@ -116,13 +116,22 @@ def scale(rigs: int, first: int, jobs: int, out: Path | None, method: str) -> No
 
 @main.command()
 @options(200)
+@click.option("--kind", "kinds", multiple=True, type=click.Choice([*KINDS, *NORMAL_KINDS]), help="All by default.")
 @click.option("--shortest", type=click.FloatRange(0, HOUR), default=0.0, help="Shortest drive, seconds.")
 @click.option("--longest", type=click.FloatRange(LENGTHS[0]), default=HOUR, help="Longest drive, seconds.")
 def failures(
-    rigs: int, first: int, jobs: int, out: Path | None, method: str, shortest: float, longest: float
+    rigs: int,
+    first: int,
+    jobs: int,
+    out: Path | None,
+    method: str,
+    kinds: Sequence[str],
+    shortest: float,
+    longest: float,
 ) -> None:
     """What is flagged, and whether rightly: drives that leave directions open, and normal ones."""
-    found = solve_all(partial(look, method=method), draw_failures(rigs, first, shortest, longest), jobs, "failures")
+    drawn = draw_failures(rigs, first, kinds or (*KINDS, *NORMAL_KINDS), shortest, longest)
+    found = solve_all(partial(look, method=method), drawn, jobs, "failures")
     title = f"{method}, a lidar and an INS, {rigs} rigs of each kind"
     tell(tell_failures(found, title) + "\n" + tell_alarms(found, f"{title} and length"), out)
 

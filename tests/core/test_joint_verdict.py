@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from calib_toolkit import se3, sync
 from calib_toolkit.joint import start, told, turning, verdict
-from calib_toolkit.joint.clocks import Clocks
+from calib_toolkit.joint.clocks import Clocks, Late
 from calib_toolkit.joint.model import read
 from calib_toolkit.joint.readings import ready
 from calib_toolkit_datasets.simulated import SimulatedSensor, path
@@ -237,13 +237,13 @@ def test_straight_on_at_changing_speed_tells_the_clocks_of_sensors_with_scale():
     found = clocks_of("straight", 3, seconds=30)
     assert list(found.open) == [False, False, True]
     sigma = np.sqrt(found.cov[0, 0])
-    assert 0 < sigma < 0.04
-    assert abs(found.clocks.dt[1] - OFFSETS[1]) < 4.5 * sigma
+    assert 0 < sigma < 0.15
+    assert abs(found.clocks.dt[1] - OFFSETS[1]) < 3 * sigma
     assert found.clocks.dt[2] == found.cov[1, 1] == 0.0
 
 
 def test_a_number_tells_a_clock_that_the_drive_does_not():
-    found = clocks_of("static", known=[turning.Late(1, -0.03, 0.001)])
+    found = clocks_of("static", known=[Late(1, -0.03, 0.001)])
     assert list(found.open) == [False, False]
     assert found.clocks.dt[1] == pytest.approx(-0.03, abs=1e-3)
     assert np.sqrt(found.cov[0, 0]) == pytest.approx(0.001, rel=0.1)

@@ -46,3 +46,12 @@ class Clocks:
     def within(self, other: "Clocks", most: float) -> "Clocks":
         """No further than so many seconds from others."""
         return replace(self, dt=np.clip(self.dt, other.dt - most, other.dt + most))
+
+
+@dataclass(frozen=True)
+class Late:
+    """An offset known beforehand. clock: which. dt, sigma: seconds."""
+
+    clock: int
+    dt: float
+    sigma: float

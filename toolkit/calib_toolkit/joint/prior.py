@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 from calib_toolkit import delta, se3
 from calib_toolkit.errors import ConfigError
 from calib_toolkit.joint import verdict
-from calib_toolkit.joint.clocks import Clocks
-from calib_toolkit.joint.turning import Late
+from calib_toolkit.joint.clocks import Clocks, Late
 from calib_toolkit.types import Measured
 
 Array = NDArray[np.float64]

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_toolkit import observability, sync
-from calib_toolkit.joint import start, turning
-from calib_toolkit.joint.clocks import Clocks
+from calib_toolkit.joint import spread, start, turning
+from calib_toolkit.joint.clocks import Clocks, Late
 from calib_toolkit.joint.readings import travel
-from calib_toolkit.joint.turning import Late, Turning
+from calib_toolkit.joint.turning import Turning
 from calib_toolkit.types import Motions
 
 Array = NDArray[np.float64]
@@ -50,7 +50,9 @@ def estimate(motions: Sequence[Motions], turned: Turning, known: Sequence[Late])
         more = ~told & _told(travels, went, known)
         more[np.setdiff1d(np.arange(len(clocks)), clocks.of[scaled])] = False
         dt, skew, told = dt + went.clocks.dt * more, skew + went.clocks.skew * more, told | more
-        cov = cov + _only(went.clock_cov, more)
+        # a speed changes so slowly that noise may be most of what changed
+        wider = np.tile(1 / np.clip(1 - went.feigned, spread.LEAST, 1.0), 2)
+        cov = cov + _only(went.clock_cov * np.outer(wider, wider), more)
     return Told(replace(clocks, dt=dt, skew=skew), cov, ~told)
 
 

@@ -6,8 +6,8 @@ maximise the likelihood with the signal integrated out. How rough the signal is,
 with them. Nothing is resampled, so nothing draws the stamps of two sensors together.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from scipy.linalg import solve_triangular
 from calib_toolkit import se3, sync
 from calib_toolkit.joint import noise, spread
 from calib_toolkit.joint.arrow import Arrow, Solved
-from calib_toolkit.joint.clocks import Clocks
+from calib_toolkit.joint.clocks import Clocks, Late
 from calib_toolkit.joint.windows import Index, Windows, coning, hats
 from calib_toolkit.types import Motions
 
@@ -43,13 +43,15 @@ class Turning:
     """R_base_sensor: (n, 3, 3). clocks: offsets and skews.
 
     cov: (p, p) of the rotations (``delta``, base axes, 3 for each sensor but the base), then the offsets and then the
-    skews of the clocks but the base's. scale: (n,) of each sensor's stated variance. freedom: (n,) degrees of freedom
+    skews of the clocks but the base's. feigned: (q-1,) share of what tells an offset that may be error of the signal.
+    scale: (n,) of each sensor's stated variance. freedom: (n,) degrees of freedom
     it is told from. kept: (n) of (m,) readings that count. rounds: until all stood still.
     """
 
     R_base_sensor: Array
     clocks: Clocks
     cov: Array
+    feigned: Array
     scale: Array
     freedom: Array
     kept: tuple[NDArray[np.bool_], ...]
@@ -62,22 +64,13 @@ class Turning:
         return self.cov[k:, k:]
 
 
-@dataclass(frozen=True)
-class Late:
-    """An offset known beforehand. clock: which. dt, sigma: seconds."""
-
-    clock: int
-    dt: float
-    sigma: float
-
-
 def estimate(motions: Sequence[Motions], R: Array, clocks: Clocks, known: Sequence[Late] = ()) -> Turning:
     """From a start that is right to a reading or so. motions: (n) in order of time. R: (n, 3, 3).
 
     A clock gets a skew where the drive shows that it has one.
     """
     search = _Search(motions, R, clocks, known)
-    others = len(clocks) - 1
+    turns, others = 3 * (len(motions) - 1), len(clocks) - 1
     free = np.arange(search.parameters) < search.parameters - others
     rounds, solved, correction = search.maximise(free)
     step, cov = _step(solved, correction, np.ones_like(free))
@@ -86,11 +79,13 @@ def estimate(motions: Sequence[Motions], R: Array, clocks: Clocks, known: Sequen
         rounds, solved, correction = search.maximise(free | own)
     _, cov = _step(solved, correction, free | own)
     stamps = [search.clocks.base_time(i, m.start) for i, m in enumerate(motions)]
-    wider = np.sqrt(spread.inflation(search.pulls(solved), stamps, cov, cov, _groups(len(motions), others)))
+    # each rotation is one thing, and so is each clock
+    groups = [*np.split(np.arange(turns), turns // 3), *(turns + np.array([[c, others + c] for c in range(others)]))]
+    wider = np.sqrt(spread.inflation(search.pulls(solved), stamps, cov, cov, groups))
     cov = cov * np.outer(wider, wider)
     kept = tuple(w > 0 for w in search.weights)
     freedom = noise.freedoms(search.readings, search.kept)
-    return Turning(search.R, search.clocks, cov, search.scale, freedom, kept, rounds)
+    return Turning(search.R, search.clocks, cov, search.feigned(solved), search.scale, freedom, kept, rounds)
 
 
 def alone(m: Motions) -> float:
@@ -190,13 +185,25 @@ class _Search:
 
         A signal is fitted best where that costs least, which depends on how the sensors' stamps lie to each other.
         """
-        correction = np.zeros(self.parameters)
+        return self.by_clock(seen, lambda w: solved.covariance(w, w.rate))
+
+    def feigned(self, solved: Solved) -> Array:
+        """(q-1,) share of the information on each clock's offset that the error of the signal would make alone."""
+        error = self.by_clock(
+            map(self.seen, range(len(self.motions))), lambda w: solved.covariance(replace(w, weights=w.rate))
+        )
+        columns = [self.clock_columns(c)[0] for c in range(1, len(self.clocks))]
+        return np.asarray(error[columns] / np.diag(solved.information)[columns])
+
+    def by_clock(self, seen: Iterable["_Seen"], covariance: Callable[[Windows], Array]) -> Array:
+        """(p,) at the clocks' places: traces of (m, 3, 3) covariances by the readings' weights, added up."""
+        total = np.zeros(self.parameters)
         for i, s in enumerate(seen):
             if c := int(self.clocks.of[i]):
                 weight = se3.rotate_cov(self.R[i], s.weight * s.counted[:, None, None])
-                pull = np.einsum("nij,nji->n", weight, solved.covariance(s.windows, s.windows.rate))
-                correction[self.clock_columns(c)] += [pull.sum(), pull @ s.since]
-        return correction
+                each = np.einsum("nij,nji->n", weight, covariance(s.windows))
+                total[self.clock_columns(c)] += [each.sum(), each @ s.since]
+        return total
 
     def judge(self, round_: int, solved: Solved, seen: Sequence["_Seen"], step: Array) -> Array:
         """Bring weights, scales and the signal's roughness up to date; (n,) by what the scales were wrong."""
@@ -251,8 +258,7 @@ class _Search:
         turns, others = 3 * (len(self.motions) - 1), len(self.clocks) - 1
         self.rates = self.rates + solved.latents(step)
         self.R[1:] = se3.exp_so3(step[:turns].reshape(-1, 3)) @ self.R[1:]
-        late, skew = step[turns : turns + others], step[turns + others :]
-        late = np.clip(late, -MOST_LATE, MOST_LATE)
+        late, skew = np.clip(step[turns : turns + others], -MOST_LATE, MOST_LATE), step[turns + others :]
         self.clocks = self.clocks.moved(np.append(0.0, late), np.append(0.0, skew)).within(self.start, LATE)
 
     def gone(self) -> Array:
@@ -281,12 +287,6 @@ class _Seen:
     by_parameter: Array
     columns: Index
     since: Array
-
-
-def _groups(sensors: int, others: int) -> list[Index]:
-    """Parameters that are one thing: each rotation, and each clock."""
-    turns = 3 * (sensors - 1)
-    return [*np.split(np.arange(turns), sensors - 1), *(turns + np.array([[c, others + c] for c in range(others)]))]
 
 
 def _step(solved: Solved, correction: Array, free: NDArray[np.bool_]) -> tuple[Array, Array]:
