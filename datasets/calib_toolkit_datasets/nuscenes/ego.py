@@ -17,7 +17,7 @@ from calib_toolkit_datasets.simulation import earth
 
 Array = NDArray[np.float64]
 
-NAME = "ego"
+NAME, TABLE = "ego", "ego_pose"
 MODALITY = "ego"
 """Of a channel that holds the vehicle's poses as they were measured; nuScenes has none."""
 SPACING_NS = 45_000_000
@@ -26,10 +26,10 @@ from fewer, and steps that are shorter than between those tell of the drawing an
 FIX = ("lat", "lon", "alt", "roll", "pitch", "yaw")
 
 
-def read(place: Place, rows: Sequence[Row], all_of_them: bool) -> tuple[Found | None, str]:
+def read(place: Place, rows: Sequence[Row], channel: str) -> tuple[Found | None, str]:
     """The poses that rows of sample_data name, and why there are none. Raises DataError.
 
-    all_of_them: also those close together.
+    channel: that of the rows, if it is one of measured poses, which are all taken; "" if they are of other sensors.
     """
     wanted = {row.text("ego_pose_token") for row in rows if "ego_pose_token" in row.values}
     if not wanted:
@@ -44,14 +44,14 @@ def read(place: Place, rows: Sequence[Row], all_of_them: bool) -> tuple[Found | 
     stamped = sorted(((row.stamp(), row) for row in found.values()), key=lambda pair: pair[0])
     ns = np.array([t for t, _ in stamped], dtype=np.int64)
     keep = np.flatnonzero((ns != tables.BLANK) & tables.increasing(ns))
-    if not all_of_them:
+    if not channel:
         keep = keep[stamps.spaced(ns[keep], SPACING_NS)]
     if not len(keep):
         return None, f"{place.tables / 'ego_pose.json'} has no pose with a stamp"
     kept = [stamped[k][1] for k in keep]
     kind = "gps_ins" if "fix" in kept[0].values else "odometry"
     readings = [_fix(row) if kind == "gps_ins" else _pose(row) for row in kept]
-    return Found(kind, ns[keep], readings, topic="ego_pose"), ""
+    return Found(kind, ns[keep], readings, topic=channel or TABLE), ""
 
 
 def to_row(reading: Fix | PoseReading, T_world_ego: Array) -> dict[str, Any]:

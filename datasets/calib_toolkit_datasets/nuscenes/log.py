@@ -4,6 +4,7 @@ Caesar et al., "nuScenes: a multimodal dataset for autonomous driving", CVPR 202
 channels are, and the vehicle's poses ``ego``.
 """
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -58,7 +59,7 @@ def open_log(path: Path, context: ReadContext) -> Log:
     found = {n: f for n, f in found.items() if len(f.ns)}
     own = next((n for n, c in channels.items() if c.modality == ego.MODALITY), "")
     rows = channels[own].rows if own else [r for c in channels.values() for r in c.rows]
-    poses, why = ego.read(place, rows, all_of_them=bool(own))
+    poses, why = ego.read(place, rows, own)
     name = own or ("ego_pose" if ego.NAME in channels else ego.NAME)
     notes = () if poses else (f"{name} is left out: {why}",)
     if poses:
@@ -68,11 +69,13 @@ def open_log(path: Path, context: ReadContext) -> Log:
         raise DataError(f"{path} holds no reading: {'; '.join([*notes, *(f'{n}: {w}' for n, w in unused.items())])}")
     epoch_ns = min(int(f.ns[0]) for f in found.values())
     streams = {n: _stream(n, f, epoch_ns) for n, f in found.items()}
-    listed = tuple(
+    listed = [
         Topic(n, c.modality, len(c.rows), _rate(found.get(n)), n if n in found else "", unused.get(n, ""))
-        for n, c in sorted(channels.items())
-    )
-    return Log(path, streams, epoch_ns, _reference(name, channels, streams), notes, listed)
+        for n, c in channels.items()
+    ]
+    if poses and not own:
+        listed.append(Topic(ego.TABLE, "poses", len(poses.ns), _rate(poses), name))
+    return Log(path, streams, epoch_ns, _reference(name, channels, streams), notes, tuple(listed))
 
 
 def _samples(place: Place) -> dict[str, bool]:
@@ -116,7 +119,8 @@ def _channels(place: Place, samples: dict[str, bool]) -> dict[str, _Channel]:
                 f"{calibrated[token].place}: {name} has a second pose in one scene; keep the rows of one of them"
             )
         channels[name] = _Channel(name, sensor.text("modality"), calibrated[token], readings)
-    return channels
+    ranks = {modality: rank for rank, modality in enumerate((*KINDS, ego.MODALITY))}
+    return dict(sorted(channels.items(), key=lambda item: (ranks.get(item[1].modality, len(ranks)), item[0])))
 
 
 def _known(row: Row, key: str, table: Mapping[str, T], file: str) -> T:
@@ -155,9 +159,8 @@ def _times(place: Place, row: Row) -> Path | str | None:
 def _camera(channel: _Channel, ns: tables.Nanoseconds, rows: list[tuple[Row, Path]], notes: tuple[str, ...]) -> Found:
     """Its images and what is known of its lens; nuScenes' own images are undistorted."""
     intrinsics, calibrated = None, channel.calibrated
-    sizes = {(row.values.get("width"), row.values.get("height")) for row, _ in rows}
-    w, h = next(iter(sizes)) if len(sizes) == 1 else (0, 0)
-    size = (w, h) if isinstance(w, int) and isinstance(h, int) and w > 0 and h > 0 else None
+    sizes = Counter((row.values["width"], row.values["height"]) for row, _ in rows if _has_size(row))
+    size = sizes.most_common(1)[0][0] if sizes else None
     distortion = np.zeros(0)
     if calibrated.values.get("camera_distortion"):
         distortion = calibrated.numbers("camera_distortion", -1)
@@ -174,6 +177,10 @@ def _camera(channel: _Channel, ns: tables.Nanoseconds, rows: list[tuple[Row, Pat
         intrinsics = CameraIntrinsics(K, distortion, size)
     load = partial(image_files.load, sensor=channel.name, size=size)
     return Found("monocular", ns, LazyReadings(load, [file for _, file in rows]), intrinsics, notes, channel.name)
+
+
+def _has_size(row: Row) -> bool:
+    return all(isinstance(n := row.values.get(key), int) and n > 0 for key in ("width", "height"))
 
 
 def _stream(name: str, found: Found, epoch_ns: int) -> Stream:

@@ -69,7 +69,7 @@ class Row:
                 f"{self.place}: the stamp {value!r} is beyond any clock in microseconds, which nuScenes has; "
                 "convert the stamps of all tables"
             )
-        return round(Decimal(repr(value)) * 1000) or tables.BLANK
+        return round(Decimal(value) * 1000) or tables.BLANK
 
     def pose(self) -> Array:
         """(4, 4) of ``translation`` (metres) and ``rotation`` (quaternion w x y z)."""
