@@ -31,6 +31,8 @@ POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
 SPACING_NS = 45_000_000
 """Least time between two poses: there is one for the reading of every sensor, some hardly apart."""
+FARTHEST = 1e7
+"""Metres along an axis; what is farther is damaged."""
 UNIT = 1e-3
 """By how much the length of a quaternion may differ from one."""
 MERGED = (
@@ -178,6 +180,8 @@ def _matrices(file: Path, table: Mapping[str, NDArray[Any]]) -> Array:
     q = np.stack([x, y, z, w], axis=-1)
     if np.any(np.abs(np.linalg.norm(q, axis=1) - 1) > UNIT):
         raise DataError(f"{file}: the quaternion qw qx qy qz is not of length one; fetch the file again")
+    if any(np.any(np.abs(column) > FARTHEST) for column in t):
+        raise DataError(f"{file}: a translation leads nowhere on earth; fetch the file again")
     return se3.rigid(Rotation.from_quat(q).as_matrix(), np.stack(t, axis=-1)) if len(q) else np.zeros((0, 4, 4))
 
 

@@ -192,6 +192,7 @@ def change(table, row, key, value):
         (change("sensor", 0, "channel", "../../x"), "the channel '../../x' is none of letters"),
         (change("sensor", 1, "channel", "LIDAR_TOP"), "LIDAR_TOP has a second pose in one scene"),
         (change("ego_pose", 3, "rotation", [0, 0, 0, 0]), "ego_pose.json, row 3: 'rotation' must be a quaternion"),
+        (change("ego_pose", 3, "translation", [1e300, 0, 0]), "row 3: 'translation' must be a place on earth"),
         (change("ego_pose", 3, "timestamp", None), "ego_pose.json, row 3: 'timestamp' must be microseconds"),
         (change("scene", 0, "name", None), "scene.json, row 0: 'name' must be a text, and is 'None'"),
         (lambda made: made["scene"].clear(), "has 0 scenes"),

@@ -26,6 +26,8 @@ LARGEST_ROW = 2**24
 BLANK = re.compile(r"[ \t\r\n]*")
 NAME = re.compile(r"[\w-]+")
 """What a channel may be called."""
+FARTHEST = 1e7
+"""Metres along an axis; what is farther is damaged."""
 UNIT = 1e-3
 """By how much the length of a quaternion may differ from one."""
 
@@ -76,6 +78,8 @@ class Row:
         t, (w, x, y, z) = self.numbers("translation", 3), self.numbers("rotation", 4)
         if abs(np.linalg.norm([w, x, y, z]) - 1) > UNIT:
             self._refuse("rotation", "a quaternion w x y z of length one")
+        if np.any(np.abs(t) > FARTHEST):
+            self._refuse("translation", "a place on earth, in metres")
         return se3.rigid(Rotation.from_quat([x, y, z, w]).as_matrix(), t)
 
     def _refuse(self, key: str, wanted: str) -> NoReturn:
