@@ -178,7 +178,7 @@ def _matrices(file: Path, table: Mapping[str, NDArray[Any]]) -> Array:
     """(n, 4, 4) of quaternions and translations."""
     w, x, y, z, *t = (table[name].astype(np.float64) for name in POSE)
     q = np.stack([x, y, z, w], axis=-1)
-    if np.any(np.abs(np.linalg.norm(q, axis=1) - 1) > UNIT):
+    if np.any(np.abs(q) > 2) or np.any(np.abs(np.linalg.norm(q, axis=1) - 1) > UNIT):
         raise DataError(f"{file}: the quaternion qw qx qy qz is not of length one; fetch the file again")
     if any(np.any(np.abs(column) > FARTHEST) for column in t):
         raise DataError(f"{file}: a translation leads nowhere on earth; fetch the file again")
@@ -195,19 +195,22 @@ def _table(file: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
     try:
         table = feather.read_table(file, memory_map=False)
         table.validate(full=True)
-    except (pyarrow.ArrowException, OSError, MemoryError) as e:
+        return {name: _column(file, table, name) for name in columns}
+    except (pyarrow.ArrowException, OSError, ValueError, MemoryError) as e:
         raise DataError(f"{file} can not be read ({' '.join(str(e).split())[:200]}); fetch the file again") from e
-    found = {}
-    for name in columns:
-        if table.column_names.count(name) != 1:
-            raise DataError(f"{file} must have one column '{name}', and has {', '.join(table.column_names)[:200]}")
-        column = table[name]
-        text, kind = name == "sensor_name", column.type
-        number = pyarrow.types.is_integer(kind) or (name != "timestamp_ns" and pyarrow.types.is_floating(kind))
-        if column.null_count or not (pyarrow.types.is_string(kind) if text else number):
-            raise DataError(f"{file}: '{name}' must be {'texts' if text else 'numbers'} in every row; fetch it again")
-        values = np.array(column.to_pylist(), dtype=object) if text else column.to_numpy()
-        if not text and not np.isfinite(values).all():
-            raise DataError(f"{file}: '{name}' holds what is not finite; fetch the file again")
-        found[name] = values
-    return found
+
+
+def _column(file: Path, table: Any, name: str) -> NDArray[Any]:
+    import pyarrow
+
+    if table.column_names.count(name) != 1:
+        raise DataError(f"{file} must have one column '{name}', and has {', '.join(table.column_names)[:200]}")
+    column = table[name]
+    text, kind = name == "sensor_name", column.type
+    number = pyarrow.types.is_integer(kind) or (name != "timestamp_ns" and pyarrow.types.is_floating(kind))
+    if column.null_count or not (pyarrow.types.is_string(kind) if text else number):
+        raise DataError(f"{file}: '{name}' must be {'texts' if text else 'numbers'} in every row; fetch it again")
+    values = np.array(column.to_pylist(), dtype=object) if text else column.to_numpy()
+    if not text and not np.isfinite(values).all():
+        raise DataError(f"{file}: '{name}' holds what is not finite; fetch the file again")
+    return values

@@ -36,11 +36,11 @@ def read(place: Place, rows: Sequence[Row], channel: str) -> tuple[Found | None,
         return None, f"no row of {place.tables / 'sample_data.json'} names an ego pose"
     if not (place.tables / "ego_pose.json").is_file():
         return None, f"{place.tables / 'ego_pose.json'} is missing"
-    found = {row.text("token"): row for row in place.rows("ego_pose") if row.values.get("token") in wanted}
+    found = {token: row for row in place.rows("ego_pose") if (token := row.text("token")) in wanted}
     for row in rows:
-        token = row.values.get("ego_pose_token")
-        if token is not None and token not in found:
-            raise DataError(f"{row.place}: ego_pose.json has no '{token[:60]}'; fetch the tables again")
+        named = row.values.get("ego_pose_token")
+        if named is not None and named not in found:
+            raise DataError(f"{row.place}: ego_pose.json has no '{named[:60]}'; fetch the tables again")
     stamped = sorted(((row.stamp(), row) for row in found.values()), key=lambda pair: pair[0])
     ns = np.array([t for t, _ in stamped], dtype=np.int64)
     keep = np.flatnonzero((ns != tables.BLANK) & tables.increasing(ns))

@@ -76,7 +76,7 @@ class Row:
     def pose(self) -> Array:
         """(4, 4) of ``translation`` (metres) and ``rotation`` (quaternion w x y z)."""
         t, (w, x, y, z) = self.numbers("translation", 3), self.numbers("rotation", 4)
-        if abs(np.linalg.norm([w, x, y, z]) - 1) > UNIT:
+        if max(map(abs, (w, x, y, z))) > 2 or abs(np.linalg.norm([w, x, y, z]) - 1) > UNIT:
             self._refuse("rotation", "a quaternion w x y z of length one")
         if np.any(np.abs(t) > FARTHEST):
             self._refuse("translation", "a place on earth, in metres")
