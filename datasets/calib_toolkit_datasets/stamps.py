@@ -58,6 +58,15 @@ def made_up(sensor: str, files: Mapping[int, Path], period_ns: int) -> Matched:
     return Matched(numbers, numbers * period_ns, tuple(files[int(n)] for n in numbers), tuple(notes))
 
 
+def spaced(ns: tables.Nanoseconds, least_ns: int) -> NDArray[np.int64]:
+    """Indices of stamps that increase, from the first on, each at least so long after the one kept before. (n,)."""
+    kept = [0] if len(ns) else []
+    for k in range(1, len(ns)):
+        if ns[k] - ns[kept[-1]] >= least_ns:
+            kept.append(k)
+    return np.array(kept, dtype=np.int64)
+
+
 def _span(numbers: NDArray[np.int64]) -> tuple[int, int]:
     return (int(numbers[0]), int(numbers[-1]) + 1) if len(numbers) else (0, 0)
 

@@ -16,7 +16,13 @@ from pathlib import Path
 from calib_toolkit import open_log
 from calib_toolkit.plugins import registry
 
-NAMES = {"rosbag1": "drive.bag", "rosbag2": "drive", "mcap": "drive.mcap", "kitti-raw": "kitti"}
+NAMES = {
+    "rosbag1": "drive.bag",
+    "rosbag2": "drive",
+    "mcap": "drive.mcap",
+    "kitti-raw": "kitti",
+    "nuscenes": "nuscenes",
+}
 BLOCK = 2**20
 
 

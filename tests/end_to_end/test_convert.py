@@ -16,7 +16,7 @@ from calib_toolkit.cli import main
 from calib_toolkit.plugins import registry
 from calib_toolkit.progress import Silent
 
-FORMATS = {"rosbag1": "a.bag", "rosbag2": "b", "mcap": "c.mcap", "kitti-raw": "d"}
+FORMATS = {"rosbag1": "a.bag", "rosbag2": "b", "mcap": "c.mcap", "kitti-raw": "d", "nuscenes": "e"}
 
 
 def call(*arguments):

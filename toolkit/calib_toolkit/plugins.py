@@ -85,13 +85,13 @@ class Registry:
         """The recording at a path, by the reader named or the one that recognises it. Raises DataError."""
         path = Path(path)
         context = ReadContext(self.sensors, self.open_log, options)
-        if not path.exists():
+        found = [d for d in self.datasets.values() if d.matches(path)]
+        if not path.exists() and not found:  # a path may go on inside a recording
             raise DataError(f"{path} does not exist; name the folder or file of a recording")
         if format_id is not None:
             if format_id not in self.datasets:
                 raise DataError(f"no reader is called '{format_id}'; there are: {', '.join(self.datasets)}")
             return self.datasets[format_id].open(path, context)
-        found = [d for d in self.datasets.values() if d.matches(path)]
         if not found:
             wanted = "; ".join(f"{d.id} looks for {d.looks_for}" for d in self.datasets.values())
             raise DataError(f"no reader knows {path}: {wanted}")

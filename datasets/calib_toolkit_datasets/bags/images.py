@@ -8,14 +8,13 @@ from numpy.typing import NDArray
 
 from calib_toolkit import CameraIntrinsics
 from calib_toolkit.errors import DataError
+from calib_toolkit_datasets import image_files
 from calib_toolkit_datasets.bags.index import Key, Source
 from calib_toolkit_datasets.bags.messages import load, place
 
 Image = NDArray[np.uint8]
 
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-LARGEST_IMAGE = 2**28
-"""Pixels of an image; what says it has more is damaged."""
 CHANNELS = {"mono": 1, "bgr": 3, "rgb": 3, "bgra": 4, "rgba": 4, "8UC1": 1, "8UC3": 3, "16UC1": 1, "yuv422": 2}
 ENCODING = re.compile(r"(?:(?P<name>mono|bgr|rgb|bgra|rgba|bayer_(?:rggb|bggr|gbrg|grbg))(?P<bits>8|16))")
 PLAIN = {"8UC1": "mono8", "8UC3": "bgr8", "16UC1": "mono16"}
@@ -129,39 +128,10 @@ def _converted(pixels: NDArray[Any], message: Any, shift: int) -> Image:
 
 
 def _decoded(message: Any, where: str) -> Image:
-    """A jpeg or png. OpenCV makes something of a file that was cut short, so its end must be there."""
-    import cv2
-
-    data = np.asarray(message.data, dtype=np.uint8)
-    raw = data.tobytes()
+    """A jpeg or png."""
     if "compressedDepth" in message.format:
         raise DataError(f"{where} is an image of depth, which no camera here reads; name another topic")
-    whole = (raw.startswith(b"\x89PNG") and b"IEND" in raw[-64:]) or (
-        raw.startswith(b"\xff\xd8") and b"\xff\xd9" in raw[-1024:]
-    )
-    width, height = _png_size(raw) or _jpeg_size(raw) or (0, 0)
-    small = 0 < width * height <= LARGEST_IMAGE
-    try:
-        image = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR) if whole and small else None
-    except cv2.error:
-        image = None
+    image = image_files.decode(np.asarray(message.data, dtype=np.uint8))
     if image is None:
         raise DataError(f"{where} is not a whole jpeg or png ('{message.format[:40]}'); leave it out")
-    return np.asarray(image, dtype=np.uint8)
-
-
-def _png_size(raw: bytes) -> tuple[int, int] | None:
-    if raw[12:16] != b"IHDR":
-        return None
-    return int.from_bytes(raw[16:20], "big"), int.from_bytes(raw[20:24], "big")
-
-
-def _jpeg_size(raw: bytes) -> tuple[int, int] | None:
-    """Of the frame's header, found from segment to segment."""
-    at = 2
-    while at + 9 <= len(raw) and raw[at] == 0xFF:
-        marker = raw[at + 1]
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            return int.from_bytes(raw[at + 7 : at + 9], "big"), int.from_bytes(raw[at + 5 : at + 7], "big")
-        at += 1 if marker == 0xFF else 2 + int.from_bytes(raw[at + 2 : at + 4], "big")
-    return None
+    return image
