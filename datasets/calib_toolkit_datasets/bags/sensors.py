@@ -186,7 +186,7 @@ class _Reader:
             if len(ns) > 1:
                 return Made("gps_ins", ns, LazyReadings(load, found), (topic, imu), frame, notes=tuple(notes))
         notes.append(
-            f"{topic} tells positions alone: neither how its antenna is turned, nor how high it is, is determined by them"
+            f"{topic} tells positions alone: they determine neither how its antenna is turned nor how high it is"
         )
         load = partial(poses.load_place, source=source, topic=topic, encoding=encoding)
         readings = LazyReadings(load, [keys[r] for r in rows])
