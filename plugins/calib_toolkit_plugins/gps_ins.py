@@ -1,4 +1,5 @@
-"""GPS/INS: fixes of position and attitude become poses with covariance (the paper's section V-C).
+"""GPS/INS: fixes of position and attitude become poses with covariance (the paper's section V-C); fixes of a receiver
+that tells no attitude, positions.
 
 The world frame is the earth's own (ECEF, WGS-84): it needs no anchor, so every slice of a drive and every drive
 share it, and coordinates of 6e6 m cost no more than a nanometre.
@@ -19,6 +20,8 @@ SEMI_MAJOR_AXIS, FLATTENING = 6378137.0, 1 / 298.257223563
 """The WGS-84 ellipsoid; metres."""
 
 COLUMNS = ("stamp", "lat_deg", "lon_deg", "alt", "roll_deg", "pitch_deg", "yaw_deg")
+ALONE = COLUMNS[:4]
+"""Of a receiver that tells positions alone."""
 SIGMA_COLUMNS = ("sigma_east", "sigma_north", "sigma_up", "sigma_roll_deg", "sigma_pitch_deg", "sigma_yaw_deg")
 
 
@@ -43,6 +46,7 @@ def estimate(stream: Stream, options: GpsInsOptions) -> Trajectory:
     As in the paper, the errors of two fixes are taken as independent, although most of the error that an INS
     states is shared by the fixes around it: relative motions are then better than claimed. A step faster than
     ``max_speed`` is a jump: it is kept, with a drift sigma of its own length, so that it weighs nothing.
+    Where no fix tells an attitude (nan), the trajectory has none.
     Raises DataError for fixes that are not numbers or not in radians.
     """
     if len(stream) < 2:
@@ -50,6 +54,8 @@ def estimate(stream: Stream, options: GpsInsOptions) -> Trajectory:
     fixes = [stream.readings[i] for i in range(len(stream))]
     rows = np.array([[f.lat, f.lon, f.alt, f.roll, f.pitch, f.yaw] for f in fixes])
     sigma = np.array([_sigma(f, options) for f in fixes])
+    alone = bool(np.isnan(rows[:, 3:]).all())
+    rows[:, 3:] = 0.0 if alone else rows[:, 3:]
     _check(stream, rows, sigma)
     R_world_enu = enu_axes(rows[:, 0], rows[:, 1])
     R_enu_sensor = _attitude(rows[:, 3:])
@@ -59,7 +65,7 @@ def estimate(stream: Stream, options: GpsInsOptions) -> Trajectory:
     step = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
     jump = np.where(step > options.max_speed * np.diff(stream.stamps), step, 0.0)
     drift[1:, :3, :3] = jump[:, None, None] ** 2 * np.eye(3)
-    return Trajectory(stream.stamps, T, cov, drift)
+    return Trajectory(stream.stamps, T, cov, drift, has_attitude=not alone)
 
 
 def ecef(lat: Array, lon: Array, alt: Array) -> Array:
@@ -83,23 +89,27 @@ def open_table(table: SensorTable) -> Log:
     """The stream of one GPS/INS table of a rig.toml. Raises DataError.
 
     ``fixes = FILE.csv``, whose first line names its columns: ``stamp,lat_deg,lon_deg,alt,roll_deg,pitch_deg,yaw_deg``
-    and at will ``sigma_east,sigma_north,sigma_up`` (metres) and ``sigma_roll_deg,sigma_pitch_deg,sigma_yaw_deg``.
+    and at will ``sigma_east,sigma_north,sigma_up`` (metres) and ``sigma_roll_deg,sigma_pitch_deg,sigma_yaw_deg``;
+    of a receiver that tells positions alone the columns of angles are left out.
     """
     tables.refuse_unknown(table, ["fixes"])
     file = tables.table_file(table, "fixes")
-    header = tables.read_rows(file, len(COLUMNS), len(COLUMNS + SIGMA_COLUMNS))[0]
+    header = tables.read_rows(file, len(ALONE), len(COLUMNS + SIGMA_COLUMNS))[0]
     names = tuple(w.lower() for w in header.words)
-    if names[:7] != COLUMNS or names[7:] not in (SIGMA_COLUMNS, SIGMA_COLUMNS[:3], SIGMA_COLUMNS[3:], ()):
+    alone = names in (ALONE, ALONE + SIGMA_COLUMNS[:3])
+    with_angles = names[:7] == COLUMNS and names[7:] in (SIGMA_COLUMNS, SIGMA_COLUMNS[:3], SIGMA_COLUMNS[3:], ())
+    if not alone and not with_angles:
         raise DataError(
             f"{file}: its first line must be {','.join(COLUMNS)} and then, at will, "
-            f"{','.join(SIGMA_COLUMNS[:3])} and {','.join(SIGMA_COLUMNS[3:])}; it is {','.join(header.words)}"
+            f"{','.join(SIGMA_COLUMNS[:3])} and {','.join(SIGMA_COLUMNS[3:])}, or the same without angles; it is "
+            f"{','.join(header.words)}"
         )
     rows = tables.read_rows(file, len(names), len(names), titles=True)[1:]
     ns, numbers = tables.to_nanoseconds(rows), tables.to_numbers(rows, len(names))
     keep, notes = tables.usable_rows(ns, numbers, rows)
     epoch_ns = int(ns[keep[0]])
     columns = {c: np.deg2rad(x) if c.endswith("_deg") else x for c, x in zip(names, numbers[keep].T, strict=True)}
-    values = np.stack([columns[c] for c in COLUMNS[1:]], axis=1)
+    values = np.stack([columns.get(c, np.full(len(keep), np.nan)) for c in COLUMNS[1:]], axis=1)
     position, rpy = (
         np.stack([columns[c] for c in group], axis=1) if group[0] in columns else [None] * len(keep)
         for group in (SIGMA_COLUMNS[:3], SIGMA_COLUMNS[3:])

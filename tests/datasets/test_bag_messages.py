@@ -255,14 +255,17 @@ def test_messages_without_a_fix_are_left_out(tmp_path):
     assert "1 of 5 messages have no fix" in stream.notes[0]
 
 
-def test_positions_alone_are_no_sensor_and_the_reason_is_said(tmp_path):
+def test_positions_alone_have_no_attitude_and_it_is_said(tmp_path):
     m = Messages("cdr")
     rows = [("/fix", START + k * SWEEP, m.fix(START + k * SWEEP, 49.0 + 1e-5 * k, 8.4, 110.0)) for k in range(5)]
     rows += [("/odom", START + k * SWEEP, m.pose(START + k * SWEEP, (k, 0, 0))) for k in range(5)]
     log = opened(write(tmp_path / "a", "sqlite", rows))
-    assert set(log.streams) == {"odom"}
-    (fix,) = (t for t in log.topics if t.name == "/fix")
-    assert "positions alone tell neither attitude nor turns" in fix.unused
+    assert set(log.streams) == {"fix", "odom"}
+    stream = log.streams["fix"]
+    assert stream.kind == "gps_ins"
+    assert all(np.isnan([f.roll, f.pitch, f.yaw]).all() for f in stream.readings)
+    np.testing.assert_allclose(np.degrees([f.lat for f in stream.readings]), 49.0 + 1e-5 * np.arange(5))
+    assert any("positions alone" in note for note in stream.notes)
 
 
 def test_an_imu_alone_turns_and_does_not_travel(tmp_path):

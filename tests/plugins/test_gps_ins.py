@@ -183,6 +183,18 @@ def test_rows_that_can_not_be_used_are_left_out_with_a_note(tmp_path: Path) -> N
     assert ["line 3" in n or "line 5" in n for n in found.notes] == [True, True]
 
 
+def test_a_table_without_angles_is_of_positions_alone(tmp_path: Path) -> None:
+    header = "stamp,lat_deg,lon_deg,alt,sigma_east,sigma_north,sigma_up"
+    rows = [f"{0.1 * k:.1f},49.0,{8.4 + 1e-5 * k},115,0.5,0.5,1.0" for k in range(4)]
+    (tmp_path / "fixes.csv").write_text("\n".join([header, *rows]))
+    found = gps_ins.open_table(SensorTable("gnss", tmp_path, {"fixes": "fixes.csv"})).streams["gnss"]
+    trajectory = estimate(found, GpsInsOptions())
+    assert not trajectory.has_attitude
+    step = np.linalg.norm(np.diff(trajectory.T_world_sensor[:, :3, 3], axis=0), axis=1)
+    assert step == pytest.approx(np.full(3, 0.7319), abs=1e-3)
+    assert np.trace(trajectory.cov[0, :3, :3]) == pytest.approx(0.5**2 + 0.5**2 + 1.0)
+
+
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [

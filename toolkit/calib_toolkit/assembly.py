@@ -77,6 +77,14 @@ def calibration(
     )
 
 
+def alone(name: str) -> Calibration:
+    """A base and nothing else."""
+    one = np.ones(1, dtype=bool)
+    return Calibration(
+        name, (name,), np.eye(4)[None], np.zeros(1), np.zeros((7, 7)), one, np.ones((1, 7), dtype=bool)
+    )
+
+
 def with_unknown(names: Sequence[str], undetermined: Sequence[Undetermined], cov: Array) -> Array:
     """A covariance (7n, 7n) with ``ANYTHING`` along directions that are not determined.
 

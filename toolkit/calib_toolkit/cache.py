@@ -37,10 +37,10 @@ def load(folder: Path, key: str) -> tuple[Motions | Trajectory, tuple[str, ...]]
     """What was stored under a key, or None; a damaged file counts as none."""
     try:
         with _file(folder, key).open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            kind = {"Motions": Motions, "Trajectory": Trajectory}[str(stored["kind"])]
+            kinds: dict[str, type[Motions] | type[Trajectory]] = {"Motions": Motions, "Trajectory": Trajectory}
+            kind = kinds[str(stored["kind"])]
             values = {f.name: stored[f.name] for f in fields(kind)}
-            if "has_scale" in values:
-                values["has_scale"] = bool(values["has_scale"])
+            values |= {name: bool(values[name]) for name in ("has_scale", "has_attitude") if name in values}
             return kind(**values), tuple(str(n) for n in stored["notes"])
     except Exception:  # whatever a damaged file makes of itself, the motion can be estimated again
         return None

@@ -27,8 +27,15 @@ class SensorMotion:
     notes: tuple[str, ...] = ()
 
     @property
+    def is_antenna(self) -> bool:
+        """Whether it tells positions alone."""
+        return isinstance(self.motion, Trajectory) and not self.motion.has_attitude
+
+    @property
     def motions(self) -> Motions:
-        """As motions between successive readings."""
+        """As motions between successive readings. Raises DataError for positions alone."""
+        if self.is_antenna:
+            raise DataError("positions without attitude tell no motion; leave that sensor out here")
         return self.motion.motions() if isinstance(self.motion, Trajectory) else self.motion
 
 

@@ -1,17 +1,17 @@
 """From a recorded drive to a calibrated rig: each sensor's own motion, then all of them together."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from calib_toolkit import appearance, cache, joint, paper
+from calib_toolkit import antenna, appearance, assembly, cache, joint, paper
 from calib_toolkit.config import Config
 from calib_toolkit.errors import ConfigError, DataError
 from calib_toolkit.estimation import SensorMotion, estimate_motions
 from calib_toolkit.plugins import Registry, registry
 from calib_toolkit.progress import Progress, Silent
 from calib_toolkit.result_file import read_calibration
-from calib_toolkit.types import Calibration, Log, Motions, Result
+from calib_toolkit.types import Calibration, Log, Motions, Result, Trajectory
 
 METHODS = {"joint": joint, "paper": paper}
 """The estimators: modules with ``calibrate`` and ``clock_offsets``."""
@@ -40,19 +40,23 @@ def calibrate(
 ) -> Result:
     """Where every sensor of the log sits and how late its clock is. Raises CalibrationError.
 
-    First each sensor's own motion, then :func:`calibrate_motions`, then what pairs that see the same place look like.
+    First each sensor's own motion, then :func:`calibrate_motions`, then what pairs that see the same place look like,
+    and at last receivers that tell positions alone.
     pictures: folder for overlays of each pair before and after that.
     """
     config, plugins, progress = config or Config(), plugins or registry(), progress or Silent()
     log = log.trim(config.start, config.duration)
     folder = cache_folder or cache.default_folder()
     moved = sensor_motions(log, config, plugins, progress, folder)
-    names = _base_first(moved, config.base)
-    skipped = [*log.notes, *(note for n in names for note in (*log.streams[n].notes, *moved[n].notes))]
+    antennas = {n: m.motion for n, m in moved.items() if isinstance(m.motion, Trajectory) and m.is_antenna}
+    names = _base_first({n: m for n, m in moved.items() if n not in antennas}, config.base)
+    skipped = [*log.notes, *(note for n in (*names, *antennas) for note in (*log.streams[n].notes, *moved[n].notes))]
     clocks = [log.streams[n].clock for n in names]
-    result = calibrate_motions({n: moved[n].motions for n in names}, config, clocks, skipped, progress)
+    motions = {n: moved[n].motions for n in names}
+    result = calibrate_motions(motions, _without(config, antennas), clocks, skipped, progress)
     whole = {n: moved[n].motion for n in names}
-    return appearance.refine(result, log, whole, config, plugins, progress, pictures, folder)
+    result = appearance.refine(result, log, whole, config, plugins, progress, pictures, folder)
+    return _with_antennas(result, motions[names[0]], antennas, config) if antennas else result
 
 
 def sensor_motions(
@@ -80,7 +84,10 @@ def calibrate_motions(
     clocks: (n,) sensors that name the same clock share one offset; each its own if empty. Raises CalibrationError.
     """
     config = config or Config()
-    found = METHODS[config.method].calibrate(motions, config, clocks or tuple(motions), progress or Silent())
+    if len(motions) == 1:
+        found = Result(assembly.alone(*motions), {})
+    else:
+        found = METHODS[config.method].calibrate(motions, config, clocks or tuple(motions), progress or Silent())
     chosen = {
         **asdict(config),
         "prior": [asdict(m) for m in config.prior],
@@ -97,8 +104,22 @@ def clock_offsets(
     return METHODS[config.method].clock_offsets(motions, config, clocks or tuple(motions))
 
 
+def _without(config: Config, sensors: Collection[str]) -> Config:
+    """The same with nothing measured of some sensors."""
+    return replace(config, prior=tuple(m for m in config.prior if m.sensor not in sensors))
+
+
+def _with_antennas(result: Result, base: Motions, antennas: Mapping[str, Trajectory], config: Config) -> Result:
+    """The result with receivers that tell positions alone, and with all that was measured."""
+    stated = {**result.configuration, "prior": [asdict(m) for m in config.prior]}
+    measured = [m for m in config.prior if m.sensor in antennas]
+    return antenna.added(replace(result, configuration=stated), base, antennas, measured)
+
+
 def _base_first(moved: Mapping[str, SensorMotion], base: str | None) -> list[str]:
     """The sensors' names, the base before the others: the one chosen, or the first that has scale."""
+    if not moved:
+        raise DataError("positions alone tell nothing of each other; add a lidar or an odometry")
     if base is not None and base not in moved:
         raise ConfigError(f"the base '{base}' is not among the sensors; there are: {', '.join(moved)}")
     scaled = [n for n, m in moved.items() if m.motions.has_scale]

@@ -76,15 +76,20 @@ def load_fix(key: FixKey, source: Source, topics: tuple[str, str], encodings: tu
     return replace(fix, roll=float(roll), pitch=float(pitch), yaw=float(yaw), sigma_rpy=sigma)
 
 
+def load_place(key: Key, source: Source, topic: str, encoding: str) -> Fix:
+    """Position alone. Raises DataError, naming file, topic and place."""
+    return place_of(load(key, source, topic, FIX, encoding), place(key, source, topic))
+
+
 def place_of(message: Any, where: str) -> Fix:
-    """The position of a NavSatFix, its attitude zero. Raises DataError for what is no place on earth."""
+    """The position of a NavSatFix, without attitude. Raises DataError for what is no place on earth."""
     at = np.array([message.latitude, message.longitude, message.altitude])
     if not np.isfinite(at).all() or np.any(np.abs(at) > LAST_PLACE):
         raise DataError(f"{where} holds no place on earth ({', '.join(map(str, at))}); leave it out")
     variance = np.diag(np.array(message.position_covariance, dtype=float).reshape(3, 3))
     stated = message.position_covariance_type and np.all(np.isfinite(variance) & (variance > 0))
     lat, lon = np.radians(at[:2])
-    return Fix(float(lat), float(lon), float(at[2]), 0.0, 0.0, 0.0, np.sqrt(variance) if stated else None)
+    return Fix(float(lat), float(lon), float(at[2]), np.nan, np.nan, np.nan, np.sqrt(variance) if stated else None)
 
 
 def has_orientation(message: Any) -> bool:

@@ -158,7 +158,7 @@ class _Reader:
         return Made("odometry", u.ns, LazyReadings(load, keys), (topic,), frame)
 
     def gnss(self, topic: str) -> Made:
-        """A GPS/INS, where an Imu of its frame or namespace tells attitude."""
+        """A GPS/INS where an Imu of its frame or namespace tells attitude, else positions alone."""
         u, source = self.usable[topic], self.bag.source
         keys, encoding = self.keys(topic), u.recorded.channel.encoding
         read = [messages.load(k, source, topic, poses.FIX, encoding) for k in keys]
@@ -185,9 +185,12 @@ class _Reader:
             ns = u.ns[rows[there]]
             if len(ns) > 1:
                 return Made("gps_ins", ns, LazyReadings(load, found), (topic, imu), frame, notes=tuple(notes))
-        raise DataError(
-            "positions alone tell neither attitude nor turns; record an Imu with orientation or an odometry, too"
+        notes.append(
+            f"{topic} tells positions alone: they determine neither how its antenna is turned nor how high it is"
         )
+        load = partial(poses.load_place, source=source, topic=topic, encoding=encoding)
+        readings = LazyReadings(load, [keys[r] for r in rows])
+        return Made("gps_ins", u.ns[rows], readings, (topic,), read[0].header.frame_id, notes=tuple(notes))
 
     def imu(self, topic: str, frame: str) -> str:
         """The Imu that tells a receiver's attitude: in its namespace, else of its frame, else the only one."""

@@ -130,7 +130,7 @@ class _Writing:
         self.counts[stream.name] += 1
 
     def fix(self, name: str, ns: int, fix: Fix, header: Any, put: Put) -> None:
-        """A NavSatFix and the Imu that holds its attitude."""
+        """A NavSatFix, and the Imu that holds its attitude if it has one."""
         place, attitude = fix.sigma_position, fix.sigma_rpy
         status = self.types["sensor_msgs/msg/NavSatStatus"](0, 1)
         put(
@@ -144,6 +144,8 @@ class _Writing:
                 0 if place is None else 2,
             ),
         )
+        if np.isnan(fix.yaw):
+            return
         turn = Rotation.from_euler("ZYX", [fix.yaw, fix.pitch, fix.roll]).as_quat()
         vector, unknown = self.types["geometry_msgs/msg/Vector3"], np.array([-1.0, *np.zeros(8)])
         put(

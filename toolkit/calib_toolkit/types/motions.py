@@ -65,12 +65,14 @@ class Trajectory:
     drift: (n, 6, 6) of the error gathered from pose k-1 to pose k, on top of all earlier drift; drift[0] is 0.
     Both are of ``(dt, delta)`` in ``t_true = t + dt``, ``R_true = Exp(delta) R``, world axes for cov, axes of
     the sensor at pose k-1 for drift.
+    has_attitude: False where only positions were told, whose rotations then mean nothing.
     """
 
     stamps: Array
     T_world_sensor: Array
     cov: Array
     drift: Array
+    has_attitude: bool = True
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -84,7 +86,7 @@ class Trajectory:
             kept.append((part.stamps[new], part.T_world_sensor[new], part.cov[new], part.drift[new]))
             last = part.stamps[-1]
         stamps, poses, cov, drift = (np.concatenate(c) for c in zip(*kept, strict=True))
-        return Trajectory(stamps, poses, cov, drift)
+        return Trajectory(stamps, poses, cov, drift, all(p.has_attitude for p in parts))
 
     def motions(self) -> Motions:
         """Motion from each pose to the next, with the covariance that both poses and the drift give it."""

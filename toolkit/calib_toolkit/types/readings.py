@@ -34,7 +34,8 @@ class Fix:
 
     lat, lon: radians; alt: metres.
     roll, pitch, yaw: radians, ``R_world_sensor = Rz(yaw) Ry(pitch) Rx(roll)``, world east-north-up, yaw zero
-    facing east and counter-clockwise positive (KITTI's OXTS).
+    facing east and counter-clockwise positive (KITTI's OXTS). All three are nan of a receiver that tells
+    positions alone.
     sigma_position: (3,) east, north, up in metres; sigma_rpy: (3,) radians; None where not stated.
     """
 
