@@ -18,7 +18,8 @@ SENSORS = [
 STREET, ROUGH = path(60, 0, "street"), path(60, 0, "rough")
 QUICK = Config(method="paper", jobs=1, timing=TimingOptions(steps=2000))
 JOINT = Config(jobs=1)
-METHODS = pytest.mark.parametrize("config", [QUICK, JOINT], ids=["paper", "joint"])
+CONFIGS = {"paper": QUICK, "joint": JOINT}
+METHODS = pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
 NAMES = np.array(["x", "y", "z", "rx", "ry", "rz", "dt"])
 
 

@@ -15,7 +15,7 @@ def test_figures_are_drawn(name, two, ring, tmp_path):
     from matplotlib.image import imread
 
     over = two if name == "pair" else ring
-    done = experiment.run(name, [over], tmp_path, experiment.Choices(2, (15.0,)), FAST, Silent())
+    done = experiment.run(name, [over], tmp_path, experiment.Choices(1, (15.0,)), FAST, Silent())
     figures.draw(name, done.rows, tmp_path / "figure.png")
     image = imread(tmp_path / "figure.png")
     assert image.shape[0] > 300
