@@ -129,12 +129,12 @@ def test_claimed_covariance_against_errors() -> None:
     """The paper's 0.1 m covers a scanner of 2 cm: mean squared error in sigmas at most the ideal 6."""
     rng = np.random.default_rng(5)
     nees = []
-    for seed in range(6):
+    for seed in range(4):
         step = np.array([rng.uniform(0.3, 2.0), *rng.normal(0, [0.02, 0.01, 0.002, 0.004, 0.02])])
         m = estimate(drive(street(seed), step, 3, seed), VelodyneOptions())
         error = m.vec - step
         nees += list(np.einsum("ni,nij,nj->n", error, np.linalg.inv(m.cov), error))
-    assert len(nees) == 12
+    assert len(nees) == 8
     assert 0.1 < np.median(nees) < 6.0
     assert np.mean(nees) < 12.0
 
