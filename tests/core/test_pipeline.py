@@ -75,7 +75,7 @@ def test_the_same_twice_is_the_same(result):
 
 @METHODS
 def test_the_base_is_the_one_chosen_and_by_default_the_first_with_scale(config):
-    log = log_of(path(30, 0, "rough"), [SENSORS[2], SENSORS[0], SENSORS[1]])
+    log = log_of(path(20, 0, "rough"), [SENSORS[2], SENSORS[0], SENSORS[1]])
     assert calibrate(log, config).calibration.names == ("velo", "cam", "ins")
     assert calibrate(log, replace(config, base="ins")).calibration.names == ("ins", "cam", "velo")
 

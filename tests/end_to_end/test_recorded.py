@@ -51,7 +51,9 @@ def angle_deg(R):
 
 
 # median and worst, ms; measured: 0.14 and 0.96 by the paper's method, 0.18 and 0.96 by the joint estimator
-@pytest.mark.parametrize(("method", "usual", "worst"), [("paper", 0.2, 1.3), ("joint", 0.25, 1.3)])
+@pytest.mark.parametrize(
+    ("method", "usual", "worst"), [pytest.param("paper", 0.2, 1.3, marks=pytest.mark.long), ("joint", 0.25, 1.3)]
+)
 def test_kitti_cameras_shifted_by_up_to_a_second_are_found(motions, method, usual, worst):
     """From 100 s the author's program came within 8.1 ms, as the median."""
     errors = []
@@ -111,7 +113,7 @@ def test_shrimp_ins_against_velodyne(motions, truth, start):
 
 
 # measured, degrees: 1.55, 1.39, 2.56 by the paper's method; 1.46, 1.35, 1.86 by the joint estimator
-@pytest.mark.parametrize(("method", "most"), [("paper", 2.3), ("joint", 1.8)])
+@pytest.mark.parametrize(("method", "most"), [pytest.param("paper", 2.3, marks=pytest.mark.long), ("joint", 1.8)])
 def test_ladybug_heads_from_half_a_minute(motions, truth, method, most):
     """The author's program: 1.69 degrees for all heads together."""
     names, true = [f"cam{i}" for i in range(5)], truth["ladybug"][:, :3, :3]

@@ -208,9 +208,9 @@ def test_another_version_of_the_plugin_makes_everything_anew(case):
     "damage",
     [
         lambda b: b"",
-        lambda b: b"junk",
-        lambda b: b[:100],
-        lambda b: b[: len(b) // 2],
+        pytest.param(lambda b: b"junk", marks=pytest.mark.long),
+        pytest.param(lambda b: b[:100], marks=pytest.mark.long),
+        pytest.param(lambda b: b[: len(b) // 2], marks=pytest.mark.long),
         lambda b: b[:-30],
         lambda b: b[:600] + bytes(x ^ 255 for x in b[600:700]) + b[700:],
         lambda b: b"PK\x03\x04" + bytes(200),

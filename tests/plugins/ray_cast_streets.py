@@ -60,12 +60,16 @@ def first_hit(boxes: Array, origin: Array, beam: Array) -> Array:
     with np.errstate(divide="ignore", invalid="ignore"):
         down = (GROUND - origin[:, 2]) / beam[:, 2]
         nearest = np.where(down > 0, down, np.inf)
+        level = np.linalg.norm(beam[:, :2], axis=1)
         for box in boxes:
+            x, y = (box[:2] - origin[:, :2]).T
+            near = np.abs(beam[:, 0] * y - beam[:, 1] * x) <= np.hypot(box[3], box[4]) * level  # others pass it by
             R_box_world = se3.exp_so3([0.0, 0.0, -box[6]])
-            start, along = (origin - box[:3]) @ R_box_world.T, beam @ R_box_world.T
+            start, along = (origin[near] - box[:3]) @ R_box_world.T, beam[near] @ R_box_world.T
             one, other = (-box[3:6] - start) / along, (box[3:6] - start) / along
             enter, leave = np.minimum(one, other).max(axis=1), np.maximum(one, other).min(axis=1)
-            nearest = np.where((enter < leave) & (enter > 0.5) & (enter < nearest), enter, nearest)
+            hit = (enter < leave) & (enter > 0.5) & (enter < nearest[near])
+            nearest[near] = np.where(hit, enter, nearest[near])
     return nearest
 
 

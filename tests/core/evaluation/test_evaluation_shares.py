@@ -25,7 +25,7 @@ def done(seen, tmp_path_factory):
         return folder, {name: run(name, seen, folder, 2) for name in ("appearance", "full")}
 
 
-@pytest.mark.parametrize("name", ["appearance", "full"])
+@pytest.mark.parametrize("name", [pytest.param("appearance", marks=pytest.mark.long), "full"])
 def test_a_cut_table_is_completed_to_the_same_bytes(name, seen, done, bowl):
     folder, _ = done
     whole = (folder / f"{name}.csv").read_bytes()
