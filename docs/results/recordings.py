@@ -70,4 +70,6 @@ def _logged(log: Path, names: Sequence[str]) -> list[str]:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit("recordings.py takes two folders: RECORDINGS, and DST for what it makes of them")
     write_all(Path(sys.argv[1]).resolve(), Path(sys.argv[2]))

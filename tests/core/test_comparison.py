@@ -57,7 +57,7 @@ def seen_from(c, base):
 
 
 def test_false_alarms_are_as_rare_as_promised_and_chi_square_is_one():
-    rng, n = np.random.default_rng(1), 3000
+    rng, n = np.random.default_rng(1), 1500
     C_a, C_b = random_cov(rng), random_cov(rng)
     found = [compare(noisy(rng, C_a), seen_from(noisy(rng, C_b), "ins")) for _ in range(n // 10)]
     found += [compare(noisy(rng, C_a), noisy(rng, C_b)) for _ in range(n - len(found))]

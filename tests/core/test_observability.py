@@ -12,7 +12,11 @@ from calib_toolkit_datasets.simulated import SimulatedSensor, path
 
 SIGMA = np.array([0.01, 0.01, 0.01, 5e-4, 5e-4, 5e-4])
 RIG = (LIDAR, INS, CAMERA)
-SEEDS = range(4)
+
+
+def seeds(quick, long):
+    """Drives of which the first few are quick enough for every run of the tests."""
+    return [*range(quick), *(pytest.param(seed, marks=pytest.mark.long) for seed in range(quick, long))]
 
 
 def steps_of(kind, seed, mounts=RIG, seconds=100, cameras=(2,)):
@@ -43,7 +47,7 @@ def directions(found, name, axes):
 TURNS, SHIFTS = ("rx", "ry", "rz"), ("x", "y", "z")
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", seeds(8, 40))
 def test_a_street_of_100_seconds_leaves_nothing_open(seed):
     """No false alarm: lidar, INS and camera, with true rotations."""
     steps = steps_of("street", seed)
@@ -53,13 +57,13 @@ def test_a_street_of_100_seconds_leaves_nothing_open(seed):
 
 
 @pytest.mark.parametrize("kind", ["street", "rough"])
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", seeds(2, 8))
 def test_nor_do_they_with_the_rotations_that_were_found(kind, seed):
     assert turns_left_open(steps_of(kind, seed, RIG[:2], cameras=())) == []
 
 
 @pytest.mark.parametrize("kind", ["planar", "turn"])
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", seeds(2, 8))
 def test_a_flat_drive_leaves_the_turn_about_its_axis_open_and_that_axis_as_position(kind, seed):
     steps = steps_of(kind, seed)
     for found, axes in ((turns_left_open(steps), TURNS), (shifts_left_open(steps), SHIFTS)):
@@ -69,7 +73,7 @@ def test_a_flat_drive_leaves_the_turn_about_its_axis_open_and_that_axis_as_posit
 
 
 @pytest.mark.parametrize("kind", ["straight", "static"])
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", seeds(2, 8))
 def test_without_turning_everything_is_open(kind, seed):
     steps = steps_of(kind, seed, RIG[:2], cameras=())
     assert len(turns_left_open(steps)) == len(shifts_left_open(steps, RIG[:2])) == 3
@@ -123,7 +127,7 @@ def times_left_open(kind, seed, clocks=("s0", "s1"), seconds=100):
     return [u.direction for u in observability.unmeasured_times([s.name for s in sensors], chains, clocks)]
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", seeds(3, 6))
 def test_time_shows_in_changing_turns_only(seed):
     assert times_left_open("street", seed) == []
     assert times_left_open("planar", seed) == []
@@ -150,7 +154,7 @@ def test_few_but_excellent_motions_are_enough():
     assert observability.unmeasured_shifts(["s0", "s1"], steps, R, []) == []
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", seeds(2, 8))
 def test_a_tenth_of_wrong_readings_hides_nothing_and_feigns_nothing(seed):
     sensors = [SimulatedSensor(f"s{i}", T, sigma=tuple(SIGMA), outliers=0.1) for i, T in enumerate(RIG[:2])]
     for kind, times, turns in (("street", 0, 0), ("planar", 0, 1), ("static", 1, 3)):

@@ -5,19 +5,11 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from small_runs import STREET, recorded
 
 from calib_toolkit import cli, open_log, read_calibration, se3
 from calib_toolkit.result_file import calibration_dict
 
-DRIVE = """
-seconds = 40
-seed = 1
-drive = "street"
-[sensors.velo]
-pose = [0.0, 0.0, 1.7, 0.0, 0.0, 0.0]
-[sensors.ins]
-pose = [-0.8, 0.3, 0.9, 0.8, -0.1, 1.0]
-"""
 METRIC = """
 import numpy as np
 from calib_toolkit import CostMetric, hookimpl, se3
@@ -54,7 +46,7 @@ def calib_register_metrics():
 def check(tmp_path, monkeypatch):
     """Writes a drive, a metric that knows its truth and a calibration that is off, and runs the command."""
     monkeypatch.setenv("COLUMNS", "100")
-    (tmp_path / "simulated.toml").write_text(DRIVE)
+    recorded(tmp_path, STREET)
     (tmp_path / "moments.toml").write_text("moments = 10\n")
     truth = open_log(tmp_path).reference
 
@@ -145,7 +137,7 @@ def test_no_sensor_in_common_is_refused(check):
 
 
 def test_no_pair_that_sees_the_same_is_not_called_good(tmp_path):
-    (tmp_path / "simulated.toml").write_text(DRIVE)
+    recorded(tmp_path, STREET)
     (tmp_path / "rig.json").write_text(json.dumps(calibration_dict(open_log(tmp_path).reference)))
     done = CliRunner().invoke(cli.main, ["check", str(tmp_path), str(tmp_path / "rig.json"), "--jobs", "1"])
     assert done.exit_code == 3, done.output

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from small_runs import STREET, recorded
 
 from calib_toolkit import cli, se3
 from calib_toolkit.result_file import write_calibration
@@ -172,21 +173,10 @@ def test_the_help_says_what_it_is_for():
 # --- run --prior
 
 
-DRIVE = """
-seconds = 40
-seed = 1
-drive = "street"
-[sensors.velo]
-pose = [0.0, 0.0, 1.7, 0.0, 0.0, 0.0]
-[sensors.ins]
-pose = [-0.8, 0.3, 0.9, 0.8, -0.1, 1.0]
-"""
-
-
 @pytest.fixture
 def run(tmp_path, monkeypatch):
     """The command with its estimator replaced; returns exit status, stderr and the configuration it was given."""
-    (tmp_path / "simulated.toml").write_text(DRIVE)
+    recorded(tmp_path, STREET)
     given = []
     monkeypatch.setattr(
         "calib_toolkit.pipeline.calibrate",

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from small_runs import STREET, recorded
 
 from calib_toolkit import cli, se3
 from calib_toolkit.result_file import read_calibration, write_calibration
@@ -16,15 +17,6 @@ NAMES = ("velo", "ins", "cam0")
 TRUE = se3.matrix([[0.0] * 6, [-0.8, 0.3, -0.8, 0.01, 0.02, 0.1], [0.3, 0.1, -0.1, -1.2, 1.2, -1.2]])
 SIGMA = np.array([0.02, 0.02, 0.03, 1e-3, 1e-3, 1e-3, 5e-4])
 FORMATS = ("autoware", "csv", "kitti", "nuscenes", "ros2", "urdf", "yaml")
-DRIVE = """
-seconds = 40
-seed = 1
-drive = "street"
-[sensors.velo]
-pose = [0.0, 0.0, 1.7, 0.0, 0.0, 0.0]
-[sensors.ins]
-pose = [-0.8, 0.3, 0.9, 0.8, -0.1, 1.0]
-"""
 
 
 def rig(**changed):
@@ -85,7 +77,7 @@ def test_an_import_states_no_sigma_unless_it_is_told(do):
 
 
 def test_a_prior_may_be_an_import_that_says_how_sure_it_is(do, tmp_path, monkeypatch):
-    (tmp_path / "simulated.toml").write_text(DRIVE)
+    recorded(tmp_path, STREET)
     given = []
     monkeypatch.setattr(
         "calib_toolkit.pipeline.calibrate", lambda log, config, *more, **o: given.append(config) or Result(rig(), {})

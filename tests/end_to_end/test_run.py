@@ -1,37 +1,19 @@
 """The whole way on a small simulated drive: the file that comes out, its numbers, and the choices of a run."""
 
 import json
-from io import StringIO
 
 import numpy as np
 import pytest
+import small_runs
 from click.testing import CliRunner
-from rich.console import Console
 from scipy.spatial.transform import Rotation
+from small_runs import SHARP_CAM, SHARP_INS, SHARP_VELO, as_array, recorded
 
-from calib_toolkit import Calibration, Config, Result, calibrate, cli, open_log
-from calib_toolkit.cli.tables import show_result
+from calib_toolkit import Config, calibrate, cli, open_log
 from calib_toolkit.result_file import calibration_dict, read_calibration, result_dict, write_result
 from calib_toolkit.types.calibration import PARAMETERS
 
-DRIVE = """
-seconds = 80
-seed = 5
-drive = "rough"
-[sensors.velo]
-pose = [0.0, 0.0, 1.7, 0.0, 0.0, 0.0]
-sigma = [0.004, 0.004, 0.004, 2e-4, 2e-4, 2e-4]
-[sensors.ins]
-pose = [-0.8, 0.3, 0.9, 0.8, -0.1, 1.0]
-dt = -0.060
-rate = 20.0
-sigma = [0.002, 0.002, 0.002, 1e-4, 1e-4, 1e-4]
-[sensors.cam0]
-pose = [0.3, 0.1, 1.6, -90.0, 0.0, -90.0]
-dt = 0.025
-has_scale = false
-sigma = [0.005, 0.005, 0.005, 2e-4, 2e-4, 2e-4]
-"""
+DRIVE = 'seconds = 80\nseed = 5\ndrive = "rough"\n' + SHARP_VELO + SHARP_INS + SHARP_CAM + "dt = 0.025\n"
 SIGMA_KEYS = ["x", "y", "z", "rx", "ry", "rz", "dt"]
 CALIBRATION_KEYS = {"base", "sensors", "covariance", "undetermined"}
 SENSOR_KEYS = {"T_base_sensor", "dt_base_sensor", "clock_skew", "t_ref", "sigma", "has_scale"}
@@ -39,23 +21,13 @@ SENSOR_KEYS = {"T_base_sensor", "dt_base_sensor", "clock_skew", "t_ref", "sigma"
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("drive")
-    (folder / "simulated.toml").write_text(DRIVE)
-    return folder
+    return recorded(tmp_path_factory.mktemp("drive"), DRIVE)
 
 
 @pytest.fixture(scope="module")
 def run(drive, tmp_path_factory):
-    """The command; returns exit status, what was printed, and the file as text."""
-
-    def run(*arguments, drive=drive, jobs=1):
-        out = tmp_path_factory.mktemp("out")
-        command = ["run", drive, "-o", out, "--jobs", jobs, *arguments]
-        done = CliRunner().invoke(cli.main, [str(a) for a in command])
-        file = out / "calibration.json"
-        return done.exit_code, done.output, file.read_text() if file.exists() else ""
-
-    return run
+    """The command on the drive, each time into a folder of its own."""
+    return lambda *arguments: small_runs.run(drive, tmp_path_factory.mktemp("out"), *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -77,10 +49,6 @@ def found(whole):
 @pytest.fixture(scope="module")
 def truth(drive):
     return open_log(drive).reference
-
-
-def as_array(rows):
-    return np.array(rows, dtype=float)
 
 
 # ---- the schema
@@ -282,129 +250,3 @@ def test_no_folder_is_written_unless_asked_for(drive, tmp_path, monkeypatch):
     done = CliRunner().invoke(cli.main, ["run", str(drive), "--jobs", "1", "--duration", "40"])
     assert done.exit_code in (0, 3), done.output
     assert list(tmp_path.iterdir()) == []
-
-
-# ---- what a plane does not tell
-
-
-@pytest.fixture(scope="module")
-def planar(run, tmp_path_factory):
-    """A drive on a plane: (what was printed, the file's content as text)."""
-    folder = tmp_path_factory.mktemp("planar")
-    (folder / "simulated.toml").write_text(DRIVE.replace('"rough"', '"planar"'))
-    status, printed, text = run(drive=folder)
-    assert status == 3, printed
-    return printed, text
-
-
-def test_what_was_not_determined_is_null_with_a_direction_and_a_sentence(planar):
-    printed, found = planar[0], json.loads(planar[1])
-    assert found["undetermined"]
-    order = found["covariance"]["order"]
-    matrix = as_array(found["covariance"]["matrix"])
-    for u in found["undetermined"]:
-        assert set(u) == {"direction", "sentence"}
-        assert set(u["direction"]) <= set(order)
-        assert np.linalg.norm(list(u["direction"].values())) == pytest.approx(1)
-        assert f"not determined: {u['sentence']}" in printed
-    for name in ("ins", "cam0"):
-        sensor = found["sensors"][name]
-        assert sensor["sigma"]["z"] is None
-        assert sensor["T_base_sensor"][2][3] is None
-        assert np.isnan(matrix[order.index(f"{name}.z")]).all()
-        assert sensor["sigma"]["dt"] > 0
-    assert np.isfinite(matrix[order.index("ins.dt"), order.index("ins.dt")])
-
-
-def test_only_the_height_of_a_planar_drive_is_open(planar):
-    """A camera, which knows no distances, hardly tells how far to the side it sits either; that is said apart."""
-    undetermined = [u for u in json.loads(planar[1])["undetermined"] if "found only to" not in u["sentence"]]
-    assert [u["direction"] for u in undetermined] == [{"ins.z": 1.0}, {"cam0.z": 1.0}]
-    assert all("or give a measured value with --prior" in u["sentence"] for u in undetermined)
-
-
-def test_a_measured_height_fills_the_null(run, tmp_path):
-    (tmp_path / "simulated.toml").write_text(DRIVE.replace('"rough"', '"planar"'))
-    (tmp_path / "tape.toml").write_text("base = 'velo'\n[ins]\nz = [-0.80, 0.02]\n")
-    status, printed, text = run("--prior", tmp_path / "tape.toml", "--sensors", "velo,ins", drive=tmp_path)
-    assert status == 0, printed
-    found = json.loads(text)
-    assert found["sensors"]["ins"]["T_base_sensor"][2][3] == pytest.approx(-0.8, abs=1e-3)
-    assert found["sensors"]["ins"]["sigma"]["z"] == pytest.approx(0.02, rel=0.02)
-    assert found["statistics"]["prior"] == ["ins.z"]
-    assert "note: held by measured values: ins.z" in printed
-
-
-def test_a_null_stays_a_null_when_read_back(planar, tmp_path):
-    (tmp_path / "calibration.json").write_text(planar[1])
-    c = read_calibration(tmp_path / "calibration.json")
-    assert not c.determined[c.index("ins"), 2]
-    assert np.isnan(c.sigma[c.index("ins"), 2])
-    assert not c.between("velo", "ins").has_scale
-    assert [u.sentence for u in c.undetermined]
-
-
-# ---- what the table says beside the numbers
-
-
-def said(**statistics):
-    """The notes below the table of a rig of two, as lines."""
-    rig = Calibration(
-        "velo", ("velo", "cam0"), np.tile(np.eye(4), (2, 1, 1)), np.zeros(2), np.eye(14), np.ones(2, bool),
-        np.ones((2, 7), bool),
-    )  # fmt: skip
-    console = Console(file=StringIO(), width=100, highlight=False)
-    show_result(Result(rig, {}, statistics=statistics), console)
-    return [line.removeprefix("note: ") for line in console.file.getvalue().splitlines() if line.startswith("note")]
-
-
-def scale(turns=1.0, shifts=1.0, kind="own", kind_of_shifts="own"):
-    return {"turns": turns, "kind": kind, "shifts": shifts, "kind_of_shifts": kind_of_shifts}
-
-
-def test_nothing_is_noted_where_all_is_well():
-    assert said() == []
-    assert said(
-        noise_scale={"velo": scale(3.9, 0.26), "cam0": {"turns": 1.0, "kind": "own"}},
-        rejected={"velo": 0.05, "cam0": 0.0},
-        bias_deg={"velo": 0.0, "cam0": 0.2},
-        driving={"cam0": {"x": 599.0, "rz": 600.0, "dt": 1e6}},
-        seconds=600.0,
-        prior=[],
-    ) == []  # fmt: skip
-    assert said(bias_deg=None) == []
-
-
-def test_a_stated_noise_that_is_off_is_noted_with_what_it_was_told_for():
-    assert said(noise_scale={"velo": scale(32.5, 0.04), "cam0": scale(9.0, 1.0)}) == [
-        "turns are noisier than stated: velo 5.7 times, cam0 3.0 times (told for each alone)",
-        "shifts are less noisy than stated: velo 5.0 times (told for each alone)",
-    ]
-    assert said(noise_scale={n: scale(1.0, 6.25, kind_of_shifts="pair") for n in ("velo", "cam0")}) == [
-        "shifts are noisier than stated: velo 2.5 times, cam0 2.5 times (told for the pair, not for each)"
-    ]
-
-
-def test_rejected_readings_and_turned_travel_are_noted():
-    assert said(rejected={"velo": 0.04, "cam0": 0.213}) == ["readings rejected because they do not fit: 21% of cam0"]
-    (note,) = said(bias_deg={"velo": 0.0, "cam0": 0.51})
-    assert note.startswith("travel is turned against turns: cam0 by 0.5 deg; a fault of that sensor's own motion")
-    assert "velo's if all have it" in note
-    assert said(prior=["cam0.z", "cam0.dt"]) == ["held by measured values: cam0.z, cam0.dt"]
-
-
-@pytest.mark.parametrize(
-    ("needs", "words"),
-    [
-        ({"x": 10, "z": 700, "rx": 5}, "12 min to know every position above to 2 cm (cam0 z needs most)"),
-        ({"z": 5, "ry": 90000}, "25 h to know every angle above to 0.06 deg (cam0 about y needs most)"),
-        (
-            {"y": 90, "rz": 300},
-            "90 s to know every position above to 2 cm (cam0 y needs most), and "
-            "5 min to know every angle above to 0.06 deg (cam0 about z needs most)",
-        ),
-    ],
-)
-def test_how_long_to_drive_is_noted_where_it_is_longer_than_was_driven(needs, words):
-    assert said(driving={"cam0": needs}, seconds=60.0) == [f"drive like this, in all, {words}"]
-    assert said(driving={"cam0": needs}, seconds=60.0, pairs=[{"metric": "im"}]) == []

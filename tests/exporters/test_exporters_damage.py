@@ -34,20 +34,7 @@ def damaged(data, rng):
         del lines[int(rng.integers(len(lines)))]
         data = bytearray(b"\n".join(lines))
     else:
-        hostile = [
-            b"nan",
-            b"1e999",
-            b"-",
-            b"[",
-            b"{",
-            b": ",
-            b"!!python/name:os.system",
-            b"&a ",
-            b"*a",
-            b"\x00",
-            b"9" * 5000,
-        ]
-        data[i:i] = hostile[int(rng.integers(len(hostile)))]
+        data[i:i] = HOSTILE[int(rng.integers(len(HOSTILE)))]
     return bytes(data)
 
 

@@ -57,10 +57,14 @@ def sweep(
     T = np.repeat(path(t + part, bumps) @ T_path_lidar, len(elevation), axis=0)
     origin, beam = T[:, :3, 3], np.einsum("nij,nj->ni", T[:, :3, :3], rays)
     distance = np.where(beam[:, 2] < 0, (GROUND - origin[:, 2]) / beam[:, 2], np.inf)
+    level = np.linalg.norm(beam[:, :2], axis=1)
     for box in BOXES:
-        sides = np.stack([(box[:3] + s * box[3:] - origin) / beam for s in (-1, 1)])
-        enter, leave = sides.min(axis=0).max(axis=1), sides.max(axis=0).min(axis=1)
-        distance = np.where((enter < leave) & (enter > 0) & (enter < distance), enter, distance)
+        x, y = (box[:2] - origin[:, :2]).T
+        near = np.abs(beam[:, 0] * y - beam[:, 1] * x) <= np.hypot(*box[3:5]) * level  # others pass it by
+        one, other = ((box[:3] + s * box[3:] - origin[near]) / beam[near] for s in (-1, 1))
+        enter, leave = np.minimum(one, other).max(axis=1), np.maximum(one, other).min(axis=1)
+        hit = (enter < leave) & (enter > 0) & (enter < distance[near])
+        distance[near] = np.where(hit, enter, distance[near])
     seen = (distance < 60.0) & (np.abs(a) < half_view)
     distance = np.where(seen, distance, 0.0)
     points = rays * (distance + 0.01 * rng.standard_normal(len(a)))[:, None]

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from calib_toolkit import CameraIntrinsics, LazyReadings, Motions, SensorTable, Stream, se3
 from calib_toolkit.errors import DataError
-from calib_toolkit.testing import SensorCase, parametrize_with_sensor_checks
 from calib_toolkit_plugins import monocular
 from calib_toolkit_plugins.image_tables import load_image
 from calib_toolkit_plugins.monocular import MonocularOptions
@@ -20,7 +19,6 @@ from calib_toolkit_plugins.monocular import MonocularOptions
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-(MONOCULAR,) = monocular.calib_register_sensors()
 SIZE = (400, 240)
 K = np.array([[300.0, 0, 199.5], [0, 300.0, 119.5], [0, 0, 1]])
 CAMERA = CameraIntrinsics(K, size=SIZE)
@@ -75,19 +73,6 @@ def drive(vec: Array, n: int = 4, camera: CameraIntrinsics = CAMERA) -> Stream:
 
 def estimate(stream: Stream, **options: Any) -> Motions:
     return monocular.estimate(stream, MonocularOptions(**options))
-
-
-test_conformance = parametrize_with_sensor_checks(
-    [
-        SensorCase(
-            MONOCULAR,
-            images,
-            T_vehicle_sensor=se3.rigid(R_vehicle_camera, np.zeros(3)),
-            readings=7,
-            nees=(0.02, 3.0),  # half a pixel is stated, and rendered corners are followed to a tenth
-        )
-    ]
-)
 
 
 @pytest.mark.parametrize("camera", [CAMERA, WIDE], ids=["rectified", "distorted"])

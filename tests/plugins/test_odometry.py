@@ -1,74 +1,15 @@
-"""Odometry: the three file formats, noise told from motion, translations without scale, and what is refused."""
+"""Odometry: the three file formats, noise told from motion, translations without scale."""
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from odometry_files import PERIOD_NS, SIGMA, START_NS, integrated, measured, noisy, opened, poses, written
 
 from calib_toolkit import DataError, MotionReading, Motions, PoseReading, SensorTable, Stream, Trajectory, se3
 from calib_toolkit.testing import FORWARD, STILL, TURNING, Drive
 from calib_toolkit_plugins import odometry
 from calib_toolkit_plugins.odometry import OdometryOptions, estimate, noise_of_steps, unit_translations
-
-Array = NDArray[np.float64]
-
-SIGMA = np.array([0.02, 0.01, 0.03, 1e-3, 2e-3, 5e-4])
-START_NS = 1317646534939040123
-PERIOD_NS = 100_000_003
-
-
-def poses(n: int, drive: Drive = TURNING) -> Array:
-    return drive.pose(0.1 * np.arange(n))
-
-
-def noisy(n: int, seed: int = 0, drive: Drive = TURNING) -> Motions:
-    T = poses(n + 1, drive)
-    vec = se3.vector(se3.relative(T[:-1], T[1:]))
-    vec = vec + SIGMA * np.random.default_rng(seed).standard_normal(vec.shape)
-    stamps = 0.1 * np.arange(n + 1)
-    return Motions(stamps[:-1], stamps[1:], vec, np.zeros((n, 6, 6)))
-
-
-def integrated(motions: Motions) -> list[Array]:
-    T = [np.eye(4)]
-    for step in se3.matrix(motions.vec):
-        T.append(T[-1] @ step)
-    return T
-
-
-def written(folder: Path, style: str, T: Sequence[Array]) -> dict[str, Any]:
-    """The poses as a file of one of the formats, and the table that names it."""
-    stamps = [START_NS + PERIOD_NS * k for k in range(len(T))]
-    seconds = [f"{s // 10**9}.{s % 10**9:09d}" for s in stamps]
-    q = Rotation.from_matrix(np.array(T)[:, :3, :3])
-    t = [" ".join(map(repr, pose[:3, 3].tolist())) for pose in T]
-    lines = {
-        "tum": [f"{s} {p} {' '.join(map(str, r))}" for s, p, r in zip(seconds, t, q.as_quat(), strict=True)],
-        "kitti": [" ".join(map(repr, pose[:3].ravel().tolist())) for pose in T],
-        "euroc": [
-            f"{s},{p.replace(' ', ',')},{','.join(map(str, r))},0,0,0"
-            for s, p, r in zip(stamps, t, q.as_quat(scalar_first=True), strict=True)
-        ],
-    }[style]
-    (folder / "poses.txt").write_text("# a comment\n\n" + "\n".join(lines) + "\n")
-    (folder / "times.txt").write_text("\n".join(seconds))
-    return {"kind": "odometry", "poses": "poses.txt", "format": style} | (
-        {"times": "times.txt"} if style == "kitti" else {}
-    )
-
-
-def opened(folder: Path, values: dict[str, Any]) -> Stream:
-    return odometry.open_table(SensorTable("slam", folder, values)).streams["slam"]
-
-
-def measured(stream: Stream) -> Motions:
-    found = estimate(stream, OdometryOptions(**stream.options))
-    assert isinstance(found, Motions)
-    return found
 
 
 @pytest.mark.parametrize("style", ["tum", "kitti", "euroc"])
@@ -207,87 +148,6 @@ def test_readings_that_hold_no_numbers_are_refused_by_name_and_stamp() -> None:
         estimate(Stream("vo", "odometry", np.arange(3.0), [MotionReading(None)] * 3), OdometryOptions())
     with pytest.raises(DataError, match=r"sensor vo: its 3 steps are too few .* state motion_sigma"):
         estimate(Stream("vo", "odometry", np.arange(4.0), [PoseReading(T) for T in poses(4)]), OdometryOptions())
-
-
-def test_rows_with_nan_or_a_stamp_that_goes_back_or_repeats_are_left_out_with_a_note(tmp_path: Path) -> None:
-    table = written(tmp_path, "tum", list(poses(30)))
-    lines = (tmp_path / "poses.txt").read_text().splitlines()
-    lines[5] = lines[5].replace(lines[5].split()[3], "nan")
-    lines[10] = lines[9]
-    lines[20], lines[21] = lines[21], lines[20]
-    (tmp_path / "poses.txt").write_text("\n".join(lines))
-    stream = opened(tmp_path, table)
-    assert len(stream) == 27
-    nan, late = stream.notes
-    assert "1 of 30 rows hold nan or nothing, the first in line 6; left out" in nan
-    assert "2 of 30 rows have a stamp that goes back or repeats, the first in line 11; left out" in late
-
-
-def test_one_stamp_that_leaps_ahead_costs_only_itself(tmp_path: Path) -> None:
-    table = written(tmp_path, "tum", list(poses(30)))
-    lines = (tmp_path / "poses.txt").read_text().splitlines()
-    lines[8] = "2" + lines[8][1:]
-    (tmp_path / "poses.txt").write_text("\n".join(lines))
-    stream = opened(tmp_path, table)
-    assert len(stream) == 29
-    assert "1 of 30 rows have a stamp that goes back or repeats, the first in line 9" in stream.notes[0]
-
-
-def test_quaternions_close_to_unit_are_normalised_and_others_refused(tmp_path: Path) -> None:
-    file = tmp_path / "poses.txt"
-    table = {"poses": "poses.txt", "format": "tum", "motion_sigma": SIGMA.tolist()}
-    file.write_text("0 0 0 0 0 0 0 1.005\n1 1 0 0 0 0 0.09983341664 0.9950041653\n")
-    assert opened(tmp_path, table).readings[0].T_world_sensor == pytest.approx(np.eye(4))
-    file.write_text("0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1.02\n")
-    with pytest.raises(DataError, match="line 2: the quaternion is not of length one; is format = 'tum' right"):
-        opened(tmp_path, table)
-
-
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        ({"poses": None}, 'sensor slam needs poses = "FILE"'),
-        ({"poses": "absent.txt"}, "there is no file .*absent.txt; correct the path"),
-        ({"poses": "image.png"}, "can not be read as text"),
-        ({"poses": "empty.txt"}, "holds no rows"),
-        ({"format": "bag"}, "format = 'bag' is unknown; write one of tum, euroc, kitti"),
-        ({"format": None}, "format = None is unknown"),
-        ({"format": "kitti"}, "line 3: 8 columns where 12 belong"),
-        ({"has_scale": "no"}, "has_scale must be true or false"),
-        ({"motion_sigma": [0.1, 0.1]}, "motion_sigma must be six positive numbers"),
-        ({"motion_sigma": [0.1, 0.1, 0.1, 0, 0, 0]}, "motion_sigma must be six positive numbers"),
-        ({"motion_sigma": "small"}, "motion_sigma must be six positive numbers"),
-        ({"sigmas": "short.txt"}, "short.txt has 1 rows and .*poses.txt 20; give one each"),
-        ({"poze": "x"}, "has the key 'poze', which is unknown here; it may have poses, format"),
-        ({"poses": "cut.txt"}, "cut.txt, line 2: 5 columns where 8 belong"),
-        ({"poses": "words.txt"}, "words.txt, line 1: 'now' is not a stamp"),
-        ({"poses": "milliseconds.txt"}, "milliseconds.txt, line 1: the stamp 1317646534939 is beyond any clock"),
-        ({"poses": "one.txt"}, "one.txt has one row"),
-        ({"poses": "frozen.txt"}, "9 of 10 rows have a stamp that goes back or repeats"),
-    ],
-    ids=lambda v: " ".join(f"{k}={x}" for k, x in v.items()) if isinstance(v, dict) else "",
-)
-def test_a_table_that_can_not_be_used_is_refused(tmp_path: Path, change: dict[str, Any], sentence: str) -> None:
-    table = written(tmp_path, "tum", list(poses(20)))
-    row = " 0 0 0 0 0 0 1\n"
-    (tmp_path / "image.png").write_bytes(b"\x89PNG\xff\xfe")
-    (tmp_path / "empty.txt").write_text("# nothing\n")
-    (tmp_path / "short.txt").write_text("1 1 1 1 1 1\n")
-    (tmp_path / "cut.txt").write_text("1" + row + "2 0 0 0 0\n")
-    (tmp_path / "words.txt").write_text("now" + row)
-    (tmp_path / "milliseconds.txt").write_text("1317646534939" + row)
-    (tmp_path / "one.txt").write_text("1" + row)
-    (tmp_path / "frozen.txt").write_text(("1" + row) * 10)
-    values = {k: v for k, v in (table | change).items() if v is not None}
-    with pytest.raises(DataError, match=sentence):
-        opened(tmp_path, values)
-
-
-def test_a_kitti_file_that_holds_no_rotations_is_refused(tmp_path: Path) -> None:
-    table = written(tmp_path, "kitti", [np.eye(4)] * 3)
-    (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2 + "1 0 0 0 0 1 0 0 0 0 -1 0\n")
-    with pytest.raises(DataError, match="line 3: the matrix is no rotation; is format = 'kitti' right"):
-        opened(tmp_path, table)
 
 
 def test_noise_of_real_odometry(recordings: Path) -> None:

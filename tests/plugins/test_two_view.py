@@ -54,9 +54,10 @@ def nees(vec: Array, seeds: range, **scene: float) -> Array:
     return np.array(out)
 
 
+@pytest.mark.parametrize("seeds", [range(80), pytest.param(range(80, 480), marks=pytest.mark.long)], ids=len)
 @pytest.mark.parametrize("vec", [FORWARD, np.array([1.0, 0, 0.1, 0, 0, 0])], ids=["forward", "sideways"])
-def test_errors_match_the_covariance(vec: Array) -> None:
-    assert 4.0 <= nees(vec, range(200)).mean() <= 6.0
+def test_errors_match_the_covariance(vec: Array, seeds: range) -> None:
+    assert 4.0 <= nees(vec, seeds).mean() <= 6.0
 
 
 @pytest.mark.long

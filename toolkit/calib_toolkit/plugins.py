@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib.metadata import Distribution, distributions
+from importlib.metadata import distributions
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar, cast
@@ -139,17 +139,16 @@ def _found(files: Iterable[Path]) -> Iterable[tuple[str, str, str, Callable[[], 
     """(label, distribution, version, loader) of every entry point, then of every file."""
     seen: set[tuple[str, str]] = set()
     for dist in distributions():
-        for point in dist.entry_points:
-            key = (_name(dist), point.name)
-            if point.group == GROUP and key not in seen:  # an editable install can be listed twice
-                seen.add(key)
-                yield f"{point.value} of {_name(dist)}", _name(dist), dist.version, point.load
+        points = dist.entry_points.select(group=GROUP)
+        if not points:
+            continue  # before its metadata are read, which is slow
+        name, version = dist.metadata["Name"], dist.version
+        for point in points:
+            if (name, point.name) not in seen:  # an editable install can be listed twice
+                seen.add((name, point.name))
+                yield f"{point.value} of {name}", name, version, point.load
     for file in files:
         yield str(file), FILE, "-", partial(_module_from, file)
-
-
-def _name(dist: Distribution) -> str:
-    return str(dist.metadata["Name"])
 
 
 def _module_from(file: Path) -> ModuleType:

@@ -60,9 +60,13 @@ class SensorCase:
         return self.sensor.estimate(stream, options)
 
     @lru_cache(maxsize=8)  # noqa: B019  a case lives as long as its test module
-    def measured(self, drive: Drive, seed: int = 0) -> Motions:
+    def found(self, drive: Drive) -> Motions | Trajectory:
+        """What the sensor makes of a drive; made once for all checks."""
+        return self.estimate(self.stream(drive))
+
+    def measured(self, drive: Drive) -> Motions:
         """The motions it measures on a drive."""
-        found = self.estimate(self.stream(drive, seed))
+        found = self.found(drive)
         return found.motions() if isinstance(found, Trajectory) else found
 
     def truth(self, drive: Drive, motions: Motions) -> Array:
