@@ -11,7 +11,6 @@
 Paths are relative to the folder of the rig.toml; ``~`` is the home folder.
 """
 
-import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
@@ -19,8 +18,9 @@ from os.path import expanduser, isfile
 from pathlib import Path
 from typing import Any
 
-from calib_toolkit import Dataset, Log, ReadContext, SensorTable, Stream, hookimpl
+from calib_toolkit import Dataset, Log, ReadContext, SensorTable, hookimpl
 from calib_toolkit.errors import DataError
+from calib_toolkit_datasets.merging import merged
 
 FILE = "rig.toml"
 
@@ -50,7 +50,7 @@ def open_log(path: Path, context: ReadContext) -> Log:
         logs.append(
             _from_log(name, table, file, context, opened) if "log" in table else _own(name, table, file, context)
         )
-    return _merged(file, logs)
+    return merged(file, logs)
 
 
 class _Keys(dict[str, Any]):
@@ -121,25 +121,3 @@ def _from_log(name: str, table: _Keys, file: Path, context: ReadContext, opened:
     sharing = [s.name for s in log.streams.values() if s.clock == stream.clock]
     clock = name if len(sharing) == 1 else f"{stream.clock} of {log.source}"
     return replace(log, streams={name: replace(stream, name=name, clock=clock)})
-
-
-def _merged(file: Path, logs: list[Log]) -> Log:
-    """One log, its epoch the first stamp of all.
-
-    Epochs are subtracted as integers, so that neither the difference between them nor a small stamp loses
-    digits to a large one.
-    """
-    epoch_ns = min((_first_ns(log, s) for log in logs for s in log.streams.values() if len(s)), default=0)
-    streams: dict[str, Stream] = {}
-    for log in logs:
-        whole, rest_ns = divmod(log.epoch_ns - epoch_ns, 10**9)
-        for name, stream in log.streams.items():
-            if name in streams:
-                raise DataError(f"{file}: two tables bring a sensor called '{name}'; rename one of them")
-            streams[name] = replace(stream, stamps=(stream.stamps + whole) + rest_ns * 1e-9)
-    return Log(file, streams, epoch_ns, notes=tuple(dict.fromkeys(note for log in logs for note in log.notes)))
-
-
-def _first_ns(log: Log, stream: Stream) -> int:
-    whole, rest = divmod(float(stream.stamps[0]), 1.0)
-    return log.epoch_ns + int(whole) * 10**9 + math.floor(rest * 1e9)
