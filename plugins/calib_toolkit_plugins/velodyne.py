@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calib_toolkit import DataError, Motions, Sensor, SensorTable, hookimpl, se3, tables
 from calib_toolkit.types import LazyReadings, Log, Scan, Stream
-from calib_toolkit_plugins import registration
+from calib_toolkit_plugins import registration, world_frame
 from calib_toolkit_plugins.registration import Surface
 
 Array = NDArray[np.float64]
@@ -66,8 +66,9 @@ def estimate(stream: Stream, options: VelodyneOptions) -> Motions:
     if len(stream) < 2:
         raise DataError(f"sensor {stream.name}: a motion takes two scans, and there are {len(stream)}")
     if not options.deskew or getattr(stream.readings[0], "times", None) is None:
-        return _motions(stream, _first_pass(stream, options))
-    first = _first_pass(stream, replace(options, cell=COARSER * options.cell))
+        return _motions(stream, _checked(stream, options, *_first_pass(stream, options)))
+    coarse = replace(options, cell=COARSER * options.cell)
+    first = _checked(stream, options, *_first_pass(stream, coarse))
     return _motions(stream, _second_pass(stream, options, first))
 
 
@@ -90,6 +91,7 @@ class _Sweep:
     points: Array
     times: Array | None
     options: VelodyneOptions
+    seen: Array
 
     @staticmethod
     def read(stream: Stream, k: int, options: VelodyneOptions) -> "_Sweep":
@@ -106,7 +108,8 @@ class _Sweep:
         if times is not None:
             usable &= np.isfinite(times)
             times = times[usable]
-        return _Sweep(points[usable], times if options.deskew else None, options)
+        seen = world_frame.middle_and_nearest(points)
+        return _Sweep(points[usable], times if options.deskew else None, options, seen)
 
     @property
     def enough(self) -> bool:
@@ -123,10 +126,21 @@ _Step = tuple[Array, Array] | None
 """``T_prev_curr`` and its covariance; None where it failed."""
 
 
-def _first_pass(stream: Stream, options: VelodyneOptions) -> list[_Step]:
-    """Every step from the motion before it; from nothing at the start and after a step that failed."""
+def _checked(stream: Stream, options: VelodyneOptions, steps: list[_Step], seen: Array) -> list[_Step]:
+    """The steps, unless the clouds were moved to a world frame. seen: (n, 4) of the scans."""
+    travelled = sum(float(np.linalg.norm(step[0][:3, 3])) for step in steps if step is not None)
+    world_frame.refuse_moved(stream, seen, travelled, options.max_range)
+    return steps
+
+
+def _first_pass(stream: Stream, options: VelodyneOptions) -> tuple[list[_Step], Array]:
+    """Every step from the motion before it; from nothing at the start and after a step that failed.
+
+    And where each scan lies, (n, 4), as :mod:`~calib_toolkit_plugins.world_frame` wants it.
+    """
     steps: list[_Step] = []
     prev, made, velocity = _Sweep.read(stream, 0, options), None, None
+    seen = [prev.seen]
     for k in range(1, len(stream)):
         curr, dt = _Sweep.read(stream, k, options), float(stream.stamps[k] - stream.stamps[k - 1])
         seed = None if velocity is None else se3.matrix(velocity * dt)
@@ -142,7 +156,8 @@ def _first_pass(stream: Stream, options: VelodyneOptions) -> list[_Step]:
         velocity = None if step is None else se3.vector(step[0]) / dt
         steps.append(step)
         prev = curr
-    return steps
+        seen.append(curr.seen)
+    return steps, np.array(seen)
 
 
 def _second_pass(stream: Stream, options: VelodyneOptions, first: list[_Step]) -> list[_Step]:
