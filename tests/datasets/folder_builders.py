@@ -172,3 +172,99 @@ def damaged(path: Path, plugins, count: int, seed: int = 0) -> tuple[int, int]:
         finally:
             file.write_bytes(raw)
     return count - refused, refused
+
+
+CAMERA_INFO = """image_width: 64
+image_height: 48
+camera_name: cam
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [50.0, 0.0, 32.0, 0.0, 50.5, 24.0, 0.0, 0.0, 1.0]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [-0.2, 0.05, 0.001, -0.001, 0.0]
+"""
+
+
+def cloud(k: int, n: int = 60) -> np.ndarray:
+    """Points with all that a driver tells, as rows of a table; times are offsets from the stamp."""
+    rng = np.random.default_rng(k)
+    kinds = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")]
+    rows = np.zeros(n, dtype=kinds)
+    for name in "xyz":
+        rows[name] = rng.uniform(-20, 20, n)
+    rows["intensity"], rows["ring"], rows["time"] = rng.random(n), rng.integers(0, 16, n), np.linspace(0, 0.1, n)
+    return rows
+
+
+def pcd(file: Path, rows: np.ndarray, style: str = "binary") -> None:
+    names = rows.dtype.names
+    letters = {"f": "F", "u": "U", "i": "I"}
+    head = [
+        *("# .PCD v0.7", "VERSION 0.7", f"FIELDS {' '.join(names)}"),
+        f"SIZE {' '.join(str(rows.dtype[n].itemsize) for n in names)}",
+        f"TYPE {' '.join(letters[rows.dtype[n].kind] for n in names)}",
+        *(f"COUNT {' '.join('1' * len(names))}", f"WIDTH {len(rows)}", "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0"),
+        *(f"POINTS {len(rows)}", f"DATA {style}"),
+    ]
+    body = rows.tobytes() if style == "binary" else text(rows)
+    file.write_bytes("\n".join(head).encode() + b"\n" + body)
+
+
+def ply(file: Path, rows: np.ndarray, style: str = "binary_little_endian") -> None:
+    kinds = {"f4": "float", "f8": "double", "u2": "ushort", "u1": "uchar", "i4": "int"}
+    head = ["ply", f"format {style} 1.0", "comment made by hand", f"element vertex {len(rows)}"]
+    head += [f"property {kinds[rows.dtype[n].str[1:]]} {n}" for n in rows.dtype.names]
+    big = rows.astype(rows.dtype.newbyteorder(">"))
+    body = {"ascii": text(rows), "binary_big_endian": big.tobytes()}.get(style, rows.tobytes())
+    file.write_bytes("\n".join([*head, "element face 0", "end_header"]).encode() + b"\n" + body)
+
+
+def text(rows: np.ndarray) -> bytes:
+    return "".join(" ".join(repr(x.item()) for x in row) + "\n" for row in rows).encode()
+
+
+def las(file: Path, rows: np.ndarray) -> None:
+    import laspy
+
+    header = laspy.LasHeader(point_format=1, version="1.2")
+    header.scales = np.full(3, 1e-4)
+    made = laspy.LasData(header)
+    made.x, made.y, made.z = (rows[c].astype(float) for c in "xyz")
+    made.intensity, made.gps_time = (rows["intensity"] * 60000).astype(np.uint16), 4e5 + rows["time"].astype(float)
+    made.write(file)
+
+
+def folder(root: Path, n: int = 12) -> Path:
+    """Clouds of every kind, a camera, a ladybug, fixes and poses, named by their stamps."""
+    ns = [START + k * STEP for k in range(n)]
+    (root / "top").mkdir(parents=True)
+    for k, t in enumerate(ns):
+        pcd(root / f"top/{t}.pcd", cloud(k), "ascii" if k % 2 else "binary")
+        image(root / f"front/{t // 10**9}.{t % 10**9:09d}.png", k)
+    (root / "front/camera_info.yaml").write_text(CAMERA_INFO)
+    for suffix, write in ((".ply", ply), (".npy", np.save), (".las", las), (".laz", las)):
+        home = root / f"lidar_{suffix[1:]}"
+        home.mkdir()
+        for k in range(n):
+            write(home / f"{k}{suffix}", cloud(k))
+        (home / "times.txt").write_text("".join(f"{t / 1e9:.6f}\n" for t in ns))
+    for head in range(3):
+        for k in range(n):
+            image(root / f"ladybug/head{head}/{k:04d}.png", k)
+        (root / f"ladybug/head{head}/camera_info.yaml").write_text(CAMERA_INFO)
+    (root / "ladybug/timestamps.txt").write_text("".join(f"{t}\n" for t in ns))
+    poses = tum_poses(drive(n), START / 1e9, 0.1)
+    (root / "slam.txt").write_text(poses)
+    rows = [w.split() for w in poses.splitlines()]
+    order = [0, 7, 4, 5, 6, 1, 2, 3]
+    lines = [",".join(r[i] for i in order) for r in rows]
+    (root / "vo.csv").write_text("\n".join(["time,qw,qx,qy,qz,px,py,pz", *lines]) + "\n")
+    titles = "stamp,lat_deg,lon_deg,alt,roll_deg,pitch_deg,yaw_deg"
+    fixes = [f"{t / 1e9:.3f},49.0,{8.4 + 1e-6 * k},110.0,0.1,0.2,{90 + k}" for k, t in enumerate(ns)]
+    (root / "gps.csv").write_text("\n".join([titles, *fixes]) + "\n")
+    (root / "README.txt").write_text("a drive\n")
+    return root
