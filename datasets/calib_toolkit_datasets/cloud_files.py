@@ -1,6 +1,7 @@
 """Clouds of points in files: .pcd, .ply, .bin, .npy, .las and .laz as columns by the names of their fields."""
 
 import io
+import logging
 import re
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from calib_toolkit.errors import DataError
 SUFFIXES = (".pcd", ".ply", ".bin", ".npy", ".las", ".laz")
 FARTHEST, LEAST = 1e8, 1e-30
 """Metres: what is beyond is no place on earth, and what is below (but zero) no length: bytes in another order."""
+DENSEST = 4
+"""Points a byte that a compressed file can hold."""
 HEADER = 65536
 """Bytes within which the header of a file must end."""
 PLY_TYPES = {
@@ -72,9 +75,10 @@ def _bin(file: Path) -> dict[str, NDArray[Any]]:
 
 
 def _npy(file: Path) -> dict[str, NDArray[Any]]:
-    table = np.load(file, allow_pickle=False)
-    if not isinstance(table, np.ndarray):
-        raise ValueError("it holds no single array")
+    try:
+        table = np.array(np.lib.format.open_memmap(file, mode="r"))  # no pickles, no more than the file holds
+    except Exception as e:  # a damaged header makes NumPy raise anything
+        raise ValueError(f"{type(e).__name__}: {e}") from e
     if table.dtype.names:
         return {n: table[n].ravel() for n in table.dtype.names if table.dtype[n].kind in "fiu"}
     if table.ndim != 2 or table.shape[1] < 3 or table.dtype.kind not in "fiu":
@@ -177,8 +181,12 @@ def _las(file: Path) -> dict[str, NDArray[Any]]:
         import laspy
     except ImportError as e:
         raise DataError(f"{file} can not be read without laspy; pip install 'calib-toolkit[las]'") from e
+    logging.getLogger("laspy").setLevel(logging.CRITICAL)  # what it says of damage, our sentence says
     try:
-        cloud = laspy.read(file)
+        with laspy.open(file) as opened:
+            if not 0 < opened.header.point_count <= DENSEST * file.stat().st_size:
+                raise ValueError(f"it says {opened.header.point_count} points in {file.stat().st_size} bytes")
+            cloud = opened.read()
         columns = {c: np.asarray(getattr(cloud, c), dtype=np.float64) for c in "xyz"}
         there = set(cloud.point_format.dimension_names)
         return columns | {c: np.asarray(cloud[c]) for c in ("intensity", "gps_time", "ring") if c in there}

@@ -3,6 +3,7 @@
     [sensors.NAME]
     kind = "odometry"          # a sensor plugin's id, then the keys that this sensor asks for
     poses = "poses.txt"
+    clock = "trigger"          # at will: sensors that name the same share one clock offset
 
     [sensors.OTHER]
     log = "2011_10_03_drive_0027_extract"    # any recording that another reader knows
@@ -20,6 +21,7 @@ from typing import Any
 
 from calib_toolkit import Dataset, Log, ReadContext, SensorTable, hookimpl
 from calib_toolkit.errors import DataError
+from calib_toolkit_datasets import rig_writing
 from calib_toolkit_datasets.merging import merged
 
 FILE = "rig.toml"
@@ -28,7 +30,8 @@ FILE = "rig.toml"
 @hookimpl
 def calib_register_datasets() -> list[Dataset]:
     """The ``rig`` reader."""
-    return [Dataset("rig", f"a {FILE} with one [sensors.NAME] table for each sensor", matches, open_log)]
+    looks_for = f"a {FILE} with one [sensors.NAME] table for each sensor"
+    return [Dataset("rig", looks_for, matches, open_log, rig_writing.write, resumes=True)]
 
 
 def matches(path: Path) -> bool:
@@ -96,8 +99,12 @@ def _own(name: str, table: _Keys, file: Path, context: ReadContext) -> Log:
             f"{table.where} is of kind '{kind}', which can not be read from a {FILE}; take it out of a recording "
             f"with 'log', or use one of: {', '.join(able) or 'none'}"
         )
-    values = _Keys({k: v for k, v in table.items() if k != "kind"}, table.where)
-    return sensor.open_table(SensorTable(name, file.absolute().parent, values))
+    values = _Keys({k: v for k, v in table.items() if k not in ("kind", "clock")}, table.where)
+    log = sensor.open_table(SensorTable(name, file.absolute().parent, values))
+    clock = table.get("clock", "")
+    if not isinstance(clock, str):
+        raise DataError(f"{table.where}: 'clock' must be a string, the same for sensors that share one clock offset")
+    return replace(log, streams={n: replace(s, clock=clock or s.clock) for n, s in log.streams.items()})
 
 
 def _from_log(name: str, table: _Keys, file: Path, context: ReadContext, opened: dict[Path, Log]) -> Log:

@@ -13,7 +13,7 @@ import numpy as np
 
 from calib_toolkit import CameraIntrinsics, Dataset, LazyReadings, Log, ReadContext, Stream, hookimpl, tables
 from calib_toolkit.errors import DataError
-from calib_toolkit_datasets import image_files
+from calib_toolkit_datasets import image_files, trajectory_writing
 from calib_toolkit_datasets.merging import from_table, merged, refuse_leaving
 
 LENSES = {
@@ -32,7 +32,8 @@ UNREAD = {
 @hookimpl
 def calib_register_datasets() -> list[Dataset]:
     """The ``tum`` reader."""
-    return [Dataset("tum", "rgb.txt, with groundtruth.txt or depth.txt beside", matches, open_log)]
+    looks_for = "rgb.txt, with groundtruth.txt or depth.txt beside"
+    return [Dataset("tum", looks_for, matches, open_log, trajectory_writing.write)]
 
 
 def matches(path: Path) -> bool:

@@ -205,7 +205,8 @@ def _motions(stream: Stream, steps: Sequence[_Step]) -> Motions:
 def open_table(table: SensorTable) -> Log:
     """The stream of one velodyne table of a rig.toml. Raises DataError.
 
-    Keys: ``scans``, a folder of .bin (KITTI: float32 x y z intensity), .npy (n, 3 or 4), .ply or .pcd files;
+    Keys: ``scans``, a folder of .bin (KITTI: float32 x y z intensity), .npy ((n, 3 or 4), or a table with columns
+    x y z and at will intensity, time and ring), .ply or .pcd files;
     ``times``, a file with the stamp of each, in the order of their names, as seconds or as KITTI's dates; at
     will ``turns = "clockwise"`` (seen from above) or ``"counterclockwise"``, which gives each point its time
     from its azimuth, the stamp being when the scanner looks along x.
@@ -239,11 +240,27 @@ def _load(file: Path, rate: float | None) -> Scan:
         raise DataError(f"{file} can not be read without Open3D ({e}); run script/setup or write .npy files") from e
     except (OSError, ValueError) as e:
         raise DataError(f"{file} is not a scan ({e}); write it anew or remove it with its stamp") from e
-    if rows.ndim != 2 or rows.shape[1] < 3:
-        raise DataError(f"{file} holds an array of shape {rows.shape}; a scan is (n, 3) or (n, 4)")
+    if rows.dtype.names and all(c in rows.dtype.names for c in "xyz"):
+        return _titled(rows)
+    if rows.ndim != 2 or rows.shape[1] < 3 or rows.dtype.kind not in "fiu":
+        raise DataError(f"{file} holds {rows.dtype} of shape {rows.shape}; a scan is (n, 3) or (n, 4) numbers")
     points = np.ascontiguousarray(rows[:, :3], dtype=np.float32)
     times = None if rate is None else (rate * np.arctan2(points[:, 1], points[:, 0])).astype(np.float32)
     return Scan(points, times, intensity=rows[:, 3].astype(np.float32) if rows.shape[1] > 3 else None)
+
+
+def _titled(rows: NDArray[Any]) -> Scan:
+    """A table with columns x, y, z and at will intensity, time (seconds from the stamp) and ring."""
+    points = np.stack([rows[c] for c in "xyz"], axis=-1).reshape(-1, 3).astype(np.float32)
+    time, intensity, ring = (
+        rows[n].ravel() if n in (rows.dtype.names or ()) else None for n in ("time", "intensity", "ring")
+    )
+    return Scan(
+        points,
+        None if time is None else time.astype(np.float32),
+        None if intensity is None else intensity.astype(np.float32),
+        None if ring is None else ring.astype(np.int32),
+    )
 
 
 def _rows(file: Path) -> NDArray[Any]:
@@ -253,7 +270,10 @@ def _rows(file: Path) -> NDArray[Any]:
             raise ValueError(f"{flat.size} numbers are not rows of four; it seems cut short")
         return flat.reshape(-1, 4)
     if file.suffix == ".npy":
-        return np.asarray(np.load(file, allow_pickle=False))
+        try:
+            return np.array(np.lib.format.open_memmap(file, mode="r"))  # no pickles, no more than the file holds
+        except Exception as e:  # a damaged header makes NumPy raise anything
+            raise ValueError(f"{type(e).__name__}: {e}") from e
     import open3d
 
     cloud = open3d.io.read_point_cloud(file)

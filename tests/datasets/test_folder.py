@@ -132,7 +132,7 @@ def test_numbers_are_no_stamps(tmp_path):
         (".pcd", b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 99999999999\nDATA binary\n", "says 9+ points"),
         (".ply", b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nend_header\n1\n", "says 2 points"),
         (".ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n1\n", "no single"),
-        (".npy", b"\x93NUMPY", "EOF"),
+        (".npy", b"\x93NUMPY", "ValueError"),
         (".las", b"LASF" + bytes(300), "ValueError"),
     ],
 )
@@ -151,7 +151,7 @@ class Evil:
 def test_a_pickle_in_an_array_is_not_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     np.save(tmp_path / "1.npy", np.array([Evil()], dtype=object), allow_pickle=True)
-    with pytest.raises(DataError, match="allow_pickle=False"):
+    with pytest.raises(DataError, match="Python objects"):
         cloud_files.read_columns(tmp_path / "1.npy", "velo")
     assert not (tmp_path / "pwned").exists()
 
