@@ -190,7 +190,9 @@ def _las(file: Path) -> dict[str, NDArray[Any]]:
         columns = {c: np.asarray(getattr(cloud, c), dtype=np.float64) for c in "xyz"}
         there = set(cloud.point_format.dimension_names)
         return columns | {c: np.asarray(cloud[c]) for c in ("intensity", "gps_time", "ring") if c in there}
-    except Exception as e:  # a damaged file makes laspy and its unpacker raise anything
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as e:  # a damaged file makes laspy raise anything, and its unpacker panic
         raise ValueError(f"{type(e).__name__}: {e}") from e
 
 

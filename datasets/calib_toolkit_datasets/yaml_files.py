@@ -13,6 +13,8 @@ def read_yaml(file: Path) -> dict[str, Any]:
     """The mapping that a file holds. Nothing in it is run: tags are refused. Raises DataError."""
     import yaml
 
+    if not file.is_file():
+        raise DataError(f"{file} is missing; fetch it")
     try:
         if file.stat().st_size > LARGEST:
             raise ValueError(f"it is larger than {LARGEST} bytes")

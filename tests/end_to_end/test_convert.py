@@ -98,7 +98,8 @@ def slow_drive(tmp_path, seconds):
     """A rig of one scanner whose readings take so long each, and the plugin that reads it."""
     plugin = tmp_path / "slow.py"
     plugin.write_text(
-        "import time\nimport numpy as np\nfrom calib_toolkit import Dataset, LazyReadings, Log, Scan, Stream, hookimpl\n"
+        "import time\nimport numpy as np\n"
+        "from calib_toolkit import Dataset, LazyReadings, Log, Scan, Stream, hookimpl\n"
         f"def load(k):\n    time.sleep({seconds})\n    return Scan(np.full((5, 3), k, 'f4'))\n"
         "def read(path, context):\n    scans = LazyReadings(load, range(40))\n"
         "    return Log(path, {'velo': Stream('velo', 'velodyne', np.arange(40.0), scans)})\n"
