@@ -9,8 +9,8 @@ Array = NDArray[np.float64]
 
 TRAVEL = 10.0
 """Metres that the middle of clouds must travel before anything is said."""
-STRAIGHT = 0.7
-"""How much of their path must lead away: a bus that stops beside the scanner moves their middle once."""
+STEADY = 0.25
+"""Share of it that must lie in each half: a bus that stops beside the scanner moves their middle once."""
 UNMOVED = 0.1
 """How little of that, as a share, the scanner itself may be seen to move."""
 MANY = 2000
@@ -44,9 +44,10 @@ def refuse_moved(stream: Stream, seen: Array, travelled: float, max_range: float
             f"{where} begin {seen[:, 3].min():.0f} m from the scanner, beyond its range of {max_range:g} m; they "
             f"look like they were moved to a world frame already, or are not in metres; {REMEDY}"
         )
-    steps = np.diff(seen[:, :3], axis=0)
-    away, path = np.linalg.norm(steps.sum(axis=0)), np.linalg.norm(steps, axis=1).sum()
-    if away > TRAVEL and away > STRAIGHT * path and travelled < UNMOVED * away:
+    first, middle, last = (part.mean(axis=0) for part in np.array_split(seen[:, :3], 3))
+    away = float(np.linalg.norm(last - first))
+    halves = (middle - first) @ (last - first), (last - middle) @ (last - first)
+    if away > TRAVEL and min(halves) > STEADY * away**2 and travelled < UNMOVED * away:
         raise DataError(
             f"{where} look like they were moved to a world frame already: their middle travels {away:.0f} m while "
             f"they lie on one another as they are; {REMEDY}"

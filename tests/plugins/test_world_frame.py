@@ -6,8 +6,8 @@ import pytest
 from calib_toolkit import DataError, Scan, Stream
 from calib_toolkit_plugins.velodyne import VelodyneOptions, estimate
 
-STEPS = 24
-POINTS = 6000
+STEPS = 19
+POINTS = 2000
 
 
 def street(rng):
@@ -32,7 +32,7 @@ def stream(step, world):
     return Stream("velo", "velodyne", 0.1 * np.arange(STEPS), scans)
 
 
-OPTIONS = VelodyneOptions(cell=0.5)
+OPTIONS = VelodyneOptions(cell=0.6)
 
 
 @pytest.mark.parametrize("step", [0.0, 1.0])
