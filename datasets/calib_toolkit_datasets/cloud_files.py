@@ -1,6 +1,5 @@
 """Clouds of points in files: .pcd, .ply, .bin, .npy, .las and .laz as columns by the names of their fields."""
 
-import io
 import logging
 import re
 from pathlib import Path
@@ -57,6 +56,7 @@ def read_columns(file: Path, sensor: str) -> dict[str, NDArray[Any]]:
     return columns
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def _refuse_garbled(columns: dict[str, NDArray[Any]]) -> None:
     xyz = np.abs(np.stack([columns[c].astype(np.float64) for c in "xyz"]))
     finite = np.isfinite(xyz)
@@ -156,14 +156,11 @@ def _table(body: bytes, fields: list[tuple[str, str, tuple[int]]], n: int, style
     if style != "ascii":
         raise ValueError(f"its data are '{style}', which is not read")
     columns = sum(shape[0] for _, _, shape in fields)
-    if n > len(body):
-        raise ValueError(f"it says {n} points and holds {len(body)} letters")
-    numbers = np.loadtxt(io.StringIO(body.decode("latin-1")), ndmin=2, max_rows=n)
-    if numbers.shape != (n, columns):
-        rows, width = numbers.shape
-        raise ValueError(f"it says {n} points of {columns} numbers and holds {rows} of {width}")
+    words = body.split()
+    if n * columns > len(words):
+        raise ValueError(f"it says {n} points of {columns} numbers and holds {len(words)} numbers")
     wide = np.dtype([(name, "f8", shape) for name, _, shape in fields])
-    return np.ascontiguousarray(numbers).view(wide).ravel()
+    return np.array(words[: n * columns], dtype=np.float64).view(wide)
 
 
 def _single(table: NDArray[Any]) -> dict[str, NDArray[Any]]:

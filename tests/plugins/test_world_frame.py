@@ -7,7 +7,7 @@ from calib_toolkit import DataError, Scan, Stream
 from calib_toolkit_plugins.velodyne import VelodyneOptions, estimate
 
 STEPS = 19
-POINTS = 2000
+POINTS = 3000
 
 
 def street(rng):
