@@ -161,7 +161,7 @@ def _images(folder: Path, name: str, home: Path, kind: str, clock: str) -> Log:
         camera = _intrinsics(folder / INFO)
     except DataError as e:
         notes = (*notes, f"{name} has no intrinsics: {e}")
-    readings = LazyReadings(partial(image_files.load_image, sensor=name), files)
+    readings = LazyReadings(partial(image_files.load, sensor=name), files)
     times = tables.seconds(ns, int(ns[0]))
     return Log(folder, {name: Stream(name, kind, times, readings, camera, False, clock, notes=notes)}, int(ns[0]))
 

@@ -115,6 +115,8 @@ def _reading(stream: Stream, k: int, file: Path, period: float) -> Fact:
         times = np.zeros(len(rows)) if reading.times is None else reading.times
         return {"worst": float(np.abs(times - made_up).max(initial=0.0))}
     if isinstance(reading, Fix):
+        if np.isnan(reading.yaw):
+            return {"bad": f"reading {k} tells no attitude, which KITTI's packets must"}
         line, off = _oxts(reading)
         file.with_suffix(".txt").write_text(line)
         return {"uneven": off, "angles": reading.sigma_rpy is not None}

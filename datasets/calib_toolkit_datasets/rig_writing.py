@@ -188,7 +188,7 @@ def _add(
         _lines(place.folder / "times.txt", stamps)
         table |= {"scans": f"{place.name}/scans", "times": f"{place.name}/times.txt"}
     elif stream.kind == "gps_ins":
-        table["fixes"] = _table(place, "fixes.csv", FIX, stamps, [facts[k] for k in kept])
+        table["fixes"] = _fixes(place, stamps, [facts[k] for k in kept])
     elif stream.kind == "odometry":
         motions = isinstance(stream.readings[kept[0]], MotionReading)
         table |= {"poses": _table(place, "poses.csv", AXES if motions else POSE, stamps, [facts[k] for k in kept])}
@@ -247,22 +247,31 @@ def _head(
     tables[name]["heads"].append(dict(lens))
 
 
+def _fixes(place: _Place, stamps: Sequence[str], facts: Sequence[Fact]) -> str:
+    """A table of fixes, without angles where none tells an attitude; its path. A sigma of zero is one not stated."""
+    alone = bool(np.isnan([f["row"][3:] for f in facts]).all())
+    stated = [i for i in (0, 1) if any(f["more"][i] for f in facts) and not (alone and i)]
+    titles = [*(FIX[:3] if alone else FIX), *(c for i in stated for c in SIGMAS[3 * i : 3 * i + 3])]
+    rows = [[*f["row"][: 3 if alone else 6], *(x for i in stated for x in f["more"][i] or [0.0] * 3)] for f in facts]
+    return _lines_of(place, "fixes.csv", titles, stamps, [_cells(row, len(titles)) for row in rows])
+
+
 def _table(place: _Place, file: str, titles: Sequence[str], stamps: Sequence[str], facts: Sequence[Fact]) -> str:
-    """A table with a line of titles, and with columns of uncertainty if any row has some; its path."""
+    """A table of poses or motions, and of their covariances if any row has one; its path."""
     rows = [_cells(f["row"], len(titles)) for f in facts]
     more: Sequence[str] = ()
-    if titles is FIX:
-        stated = [any(f["more"][i] for f in facts) for i in (0, 1)]
-        more = [c for i in (0, 1) if stated[i] for c in SIGMAS[3 * i : 3 * i + 3]]
-        unstated = [0.0] * 3  # what a fix without a sigma says
-        for row, f in zip(rows, facts, strict=True):
-            row += [repr(x) for i in (0, 1) if stated[i] for x in f["more"][i] or unstated]
-    elif any(f["more"] for f in facts):
+    if any(f["more"] for f in facts):
         more = [name for _, _, name in COV]
         for row, f in zip(rows, facts, strict=True):
             row += _cells(f["more"], len(COV))
+    return _lines_of(place, file, [*titles, *more], stamps, rows)
+
+
+def _lines_of(
+    place: _Place, file: str, titles: Sequence[str], stamps: Sequence[str], rows: Sequence[Sequence[str]]
+) -> str:
     lines = [",".join([t, *row]) for t, row in zip(stamps, rows, strict=True)]
-    _lines(place.folder / file, [",".join(["stamp", *titles, *more]), *lines])
+    _lines(place.folder / file, [",".join(["stamp", *titles]), *lines])
     return f"{place.name}/{file}"
 
 

@@ -37,6 +37,9 @@ def write(log: Log, path: Path, progress: Progress) -> Written:
         if any(isinstance(r, MotionReading) for _, r in read) and not stream.has_scale:
             lost.append(f"{name}: {len(read)} motions without scale, which tell no trajectory")
             continue
+        if any(isinstance(r, Fix) and np.isnan(r.yaw) for _, r in read):
+            lost.append(f"{name}: {len(read)} positions without attitude, which are no poses")
+            continue
         pieces = list(_pieces(read))
         for i, piece in enumerate(pieces):
             rows = _rows(log, stream, piece)

@@ -225,6 +225,20 @@ def test_a_fix_is_east_north_and_up_of_the_first(tmp_path):
     np.testing.assert_allclose(rows[0, 4:], [0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-12)
 
 
+def test_positions_without_attitude(tmp_path):
+    fixes = [Fix(0.85, 0.14 + 1e-7 * k, 100.0, *[np.nan] * 3, np.full(3, 0.1)) for k in range(N)]
+    log = Log(Path("here"), {"gps": Stream("gps", "gps_ins", np.arange(1.0 * N), fixes)}, build.START)
+    rig_writing.write(log, tmp_path / "r", Silent())
+    found = opened(tmp_path / "r").streams["gps"].readings[4]
+    assert np.isnan([found.roll, found.pitch, found.yaw]).all()
+    assert (found.lon, found.sigma_position.tolist()) == (pytest.approx(fixes[4].lon, rel=1e-15), [0.1] * 3)
+    with pytest.raises(DataError, match="no sensor that tells a trajectory"):
+        trajectory_writing.write(log, tmp_path / "t", Silent())
+    done = kitti_writing.write(log, tmp_path / "k", Silent())
+    assert done.readings["gps"] == 0
+    assert "tells no attitude" in done.lost[0]
+
+
 def test_names_that_files_can_not_have(tmp_path):
     log = whole_log()
     stream = log.streams["slam"]
