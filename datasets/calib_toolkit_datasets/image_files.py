@@ -1,11 +1,15 @@
 """Jpeg and png files, of which all must be there: OpenCV makes something of one that was cut short."""
 
+from os.path import isfile
 from pathlib import Path
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_toolkit import tables
 from calib_toolkit.errors import DataError
+from calib_toolkit_datasets.merging import refuse_leaving
 
 Image = NDArray[np.uint8]
 
@@ -18,10 +22,8 @@ def decode(data: NDArray[np.uint8]) -> Image | None:
     import cv2
 
     raw = data.tobytes()
-    whole = (raw.startswith(b"\x89PNG") and b"IEND" in raw[-64:]) or (
-        raw.startswith(b"\xff\xd8") and b"\xff\xd9" in raw[-1024:]
-    )
-    width, height = _png_size(raw) or _jpeg_size(raw) or (0, 0)
+    whole = _png_is_whole(raw) or (raw.startswith(b"\xff\xd8") and b"\xff\xd9" in raw[-1024:])
+    width, height = size_of(raw)
     if not whole or not 0 < width * height <= LARGEST:
         return None
     try:
@@ -50,6 +52,50 @@ def load(path: Path, sensor: str, size: tuple[int, int] | None = None) -> Image:
             f"{size[0]} x {size[1]} belong; use the calibration that belongs to these images"
         )
     return image
+
+
+def listed(
+    name: str, file: Path, unit: str, folder: Path, root: Path
+) -> tuple[tables.Nanoseconds, list[Path], tuple[str, ...]]:
+    """Stamps (n,), increasing, and images of a list whose rows are a stamp in ``unit`` seconds and a file's name.
+
+    folder: where the names start. root: what no name may lead out of. Images that are missing and stamps that go back
+    or repeat are left out, which sentences say. Raises DataError.
+    """
+    rows = tables.read_rows(file, 2, 2)
+    ns = tables.to_nanoseconds(rows, unit)
+    paths = [folder / row.words[1] for row in rows]
+    refuse_leaving(root, paths)
+    there = np.array([ns[k] != tables.BLANK and isfile(p) for k, p in enumerate(paths)])
+    rows_there = np.flatnonzero(there)
+    keep = rows_there[tables.increasing(ns[rows_there])] if len(rows_there) else rows_there
+    gone, late = len(rows) - len(rows_there), len(rows_there) - len(keep)
+    notes = []
+    if gone:
+        first = rows[int(np.argmin(there))]
+        notes.append(f"{name}: {gone} of {len(rows)} images have no file or no stamp, the first in {first.place}")
+    if late:
+        notes.append(f"{name}: {late} of {len(rows)} images whose stamps repeat or go back are left out")
+    if len(keep) < 2:
+        raise DataError(f"{file} lists {len(keep)} images that are there and have a stamp; a motion takes two")
+    return ns[keep], [paths[k] for k in keep], tuple(notes)
+
+
+def size_of(raw: bytes) -> tuple[int, int]:
+    """(width, height) that the beginning of a png or jpeg says, zeros if it says none."""
+    return _png_size(raw) or _jpeg_size(raw) or (0, 0)
+
+
+def _png_is_whole(raw: bytes) -> bool:
+    """Whether its parts, each of a length, a name, data and their sum, follow one another to the last."""
+    at, name = 8, b""
+    while raw.startswith(b"\x89PNG") and at + 12 <= len(raw) and name != b"IEND":
+        end = at + 8 + int.from_bytes(raw[at : at + 4], "big")
+        name = raw[at + 4 : at + 8]
+        if crc32(raw[at + 4 : end]).to_bytes(4, "big") != raw[end : end + 4]:
+            return False
+        at = end + 4
+    return name == b"IEND"
 
 
 def _png_size(raw: bytes) -> tuple[int, int] | None:

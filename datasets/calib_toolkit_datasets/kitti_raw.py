@@ -29,7 +29,7 @@ LONGEST_SWEEP = 1.0  # seconds; start and end stamps further apart do not belong
 def calib_register_datasets() -> list[Dataset]:
     """The ``kitti-raw`` reader."""
     looks_for = "a drive folder with timestamps.txt in velodyne_points, image_00 to image_03 or oxts"
-    return [Dataset("kitti-raw", looks_for, matches, open_log, kitti_writing.write)]
+    return [Dataset("kitti-raw", looks_for, matches, open_log, kitti_writing.write, resumes=True)]
 
 
 def matches(path: Path) -> bool:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from calib_toolkit import Calibration, CameraIntrinsics, Fix, Log, Progress, Scan, Stream, Written, se3
 from calib_toolkit.errors import DataError
+from calib_toolkit_datasets.journal import Fact, Journal
 from calib_toolkit_datasets.kitti_files import sweep_times
 
 Array = NDArray[np.float64]
@@ -34,9 +35,10 @@ def write(log: Log, path: Path, progress: Progress) -> Written:
     day = str(np.datetime64(max(log.epoch_ns, 0), "ns").astype("M8[D]")).replace("-", "_")
     drive = path / f"{day}_drive_0000_extract"
     counts = dict.fromkeys(log.streams, 0)
-    for name, stream in placed.items():
-        progress.begin(stream.name, len(stream))
-        counts[stream.name] = _stream(log, name, stream, drive / FOLDERS[name], progress, lost)
+    with Journal(path) as journal:
+        for name, stream in placed.items():
+            journal.begin(stream, progress)
+            counts[stream.name] = _stream(log, name, stream, drive / FOLDERS[name], journal, progress, lost)
     cameras = {name: s for name, s in placed.items() if name.startswith("cam") and s.intrinsics}
     names = {s.name: name for name, s in placed.items()}
     (path / "calib_cam_to_cam.txt").write_text(_cameras(cameras, log.reference, lost))
@@ -63,35 +65,26 @@ def _placed(log: Log) -> tuple[dict[str, Stream], list[str]]:
     return placed, lost
 
 
-def _stream(log: Log, name: str, stream: Stream, folder: Path, progress: Progress, lost: list[str]) -> int:
+def _stream(
+    log: Log, name: str, stream: Stream, folder: Path, journal: Journal, progress: Progress, lost: list[str]
+) -> int:
     """Readings as numbered files and their stamps; how many were written."""
     data = folder / "data"
     kept: list[int] = []
-    data.mkdir(parents=True)
+    data.mkdir(parents=True, exist_ok=True)
     period = stream.period if len(stream) > 1 else 0.1
     worst, uneven, angles, bad = 0.0, 0.0, False, []
     for k in range(len(stream)):
-        try:
-            reading = stream.readings[k]
-        except DataError as e:
-            bad.append(str(e))
-            continue
-        finally:
+        fact = journal.known(stream, k)
+        if fact is None:
+            fact = _reading(stream, k, data / f"{len(kept):010d}", period)
+            journal.note(stream, k, fact)
             progress.advance(stream.name, 1)
-        file = data / f"{len(kept):010d}"
-        if isinstance(reading, Scan):
-            intensity = np.zeros(len(reading.points)) if reading.intensity is None else reading.intensity
-            rows = np.column_stack([reading.points, intensity]).astype("<f4")
-            file.with_suffix(".bin").write_bytes(rows.tobytes())
-            made_up = sweep_times(np.ascontiguousarray(reading.points, dtype=np.float32), period)
-            times = np.zeros(len(rows)) if reading.times is None else reading.times
-            worst = max(worst, float(np.abs(times - made_up).max(initial=0.0)))
-        elif isinstance(reading, Fix):
-            line, off = _oxts(reading)
-            file.with_suffix(".txt").write_text(line)
-            uneven, angles = max(uneven, off), angles or reading.sigma_rpy is not None
-        else:
-            _png(file.with_suffix(".png"), reading, stream, k)
+        if "bad" in fact:
+            bad.append(fact["bad"])
+            continue
+        worst, uneven = max(worst, fact.get("worst", 0.0)), max(uneven, fact.get("uneven", 0.0))
+        angles = angles or fact.get("angles", False)
         kept.append(k)
     ns = log.epoch_ns + np.round(stream.stamps[kept] * 1e9).astype(np.int64)
     _stamps(folder, ns, period if name == "velo" else None)
@@ -106,6 +99,29 @@ def _stream(log: Log, name: str, stream: Stream, folder: Path, progress: Progres
     if stream.intrinsics is not None and stream.intrinsics.mask is not None:
         lost.append(f"{stream.name}: the mask of its images, for which KITTI has no place")
     return len(kept)
+
+
+def _reading(stream: Stream, k: int, file: Path, period: float) -> Fact:
+    """One reading as its file, and what of it KITTI has no place for."""
+    try:
+        reading = stream.readings[k]
+    except DataError as e:
+        return {"bad": str(e)}
+    if isinstance(reading, Scan):
+        intensity = np.zeros(len(reading.points)) if reading.intensity is None else reading.intensity
+        rows = np.column_stack([reading.points, intensity]).astype("<f4")
+        file.with_suffix(".bin").write_bytes(rows.tobytes())
+        made_up = sweep_times(np.ascontiguousarray(reading.points, dtype=np.float32), period)
+        times = np.zeros(len(rows)) if reading.times is None else reading.times
+        return {"worst": float(np.abs(times - made_up).max(initial=0.0))}
+    if isinstance(reading, Fix):
+        if np.isnan(reading.yaw):
+            return {"bad": f"reading {k} tells no attitude, which KITTI's packets must"}
+        line, off = _oxts(reading)
+        file.with_suffix(".txt").write_text(line)
+        return {"uneven": off, "angles": reading.sigma_rpy is not None}
+    _png(file.with_suffix(".png"), reading, stream, k)
+    return {}
 
 
 def _oxts(fix: Fix) -> tuple[str, float]:

@@ -3,6 +3,7 @@
     [sensors.NAME]
     kind = "odometry"          # a sensor plugin's id, then the keys that this sensor asks for
     poses = "poses.txt"
+    clock = "trigger"          # at will: sensors that name the same share one clock offset
 
     [sensors.OTHER]
     log = "2011_10_03_drive_0027_extract"    # any recording that another reader knows
@@ -11,7 +12,6 @@
 Paths are relative to the folder of the rig.toml; ``~`` is the home folder.
 """
 
-import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
@@ -19,8 +19,10 @@ from os.path import expanduser, isfile
 from pathlib import Path
 from typing import Any
 
-from calib_toolkit import Dataset, Log, ReadContext, SensorTable, Stream, hookimpl
+from calib_toolkit import Dataset, Log, ReadContext, SensorTable, hookimpl
 from calib_toolkit.errors import DataError
+from calib_toolkit_datasets import rig_writing
+from calib_toolkit_datasets.merging import merged
 
 FILE = "rig.toml"
 
@@ -28,7 +30,8 @@ FILE = "rig.toml"
 @hookimpl
 def calib_register_datasets() -> list[Dataset]:
     """The ``rig`` reader."""
-    return [Dataset("rig", f"a {FILE} with one [sensors.NAME] table for each sensor", matches, open_log)]
+    looks_for = f"a {FILE} with one [sensors.NAME] table for each sensor"
+    return [Dataset("rig", looks_for, matches, open_log, rig_writing.write, resumes=True)]
 
 
 def matches(path: Path) -> bool:
@@ -50,7 +53,7 @@ def open_log(path: Path, context: ReadContext) -> Log:
         logs.append(
             _from_log(name, table, file, context, opened) if "log" in table else _own(name, table, file, context)
         )
-    return _merged(file, logs)
+    return merged(file, logs)
 
 
 class _Keys(dict[str, Any]):
@@ -96,8 +99,12 @@ def _own(name: str, table: _Keys, file: Path, context: ReadContext) -> Log:
             f"{table.where} is of kind '{kind}', which can not be read from a {FILE}; take it out of a recording "
             f"with 'log', or use one of: {', '.join(able) or 'none'}"
         )
-    values = _Keys({k: v for k, v in table.items() if k != "kind"}, table.where)
-    return sensor.open_table(SensorTable(name, file.absolute().parent, values))
+    values = _Keys({k: v for k, v in table.items() if k not in ("kind", "clock")}, table.where)
+    log = sensor.open_table(SensorTable(name, file.absolute().parent, values))
+    clock = table.get("clock", "")
+    if not isinstance(clock, str):
+        raise DataError(f"{table.where}: 'clock' must be a string, the same for sensors that share one clock offset")
+    return replace(log, streams={n: replace(s, clock=clock or s.clock) for n, s in log.streams.items()})
 
 
 def _from_log(name: str, table: _Keys, file: Path, context: ReadContext, opened: dict[Path, Log]) -> Log:
@@ -121,25 +128,3 @@ def _from_log(name: str, table: _Keys, file: Path, context: ReadContext, opened:
     sharing = [s.name for s in log.streams.values() if s.clock == stream.clock]
     clock = name if len(sharing) == 1 else f"{stream.clock} of {log.source}"
     return replace(log, streams={name: replace(stream, name=name, clock=clock)})
-
-
-def _merged(file: Path, logs: list[Log]) -> Log:
-    """One log, its epoch the first stamp of all.
-
-    Epochs are subtracted as integers, so that neither the difference between them nor a small stamp loses
-    digits to a large one.
-    """
-    epoch_ns = min((_first_ns(log, s) for log in logs for s in log.streams.values() if len(s)), default=0)
-    streams: dict[str, Stream] = {}
-    for log in logs:
-        whole, rest_ns = divmod(log.epoch_ns - epoch_ns, 10**9)
-        for name, stream in log.streams.items():
-            if name in streams:
-                raise DataError(f"{file}: two tables bring a sensor called '{name}'; rename one of them")
-            streams[name] = replace(stream, stamps=(stream.stamps + whole) + rest_ns * 1e-9)
-    return Log(file, streams, epoch_ns, notes=tuple(dict.fromkeys(note for log in logs for note in log.notes)))
-
-
-def _first_ns(log: Log, stream: Stream) -> int:
-    whole, rest = divmod(float(stream.stamps[0]), 1.0)
-    return log.epoch_ns + int(whole) * 10**9 + math.floor(rest * 1e9)

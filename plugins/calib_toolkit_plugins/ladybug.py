@@ -16,7 +16,7 @@ def open_table(table: SensorTable) -> Log:
     """The heads of one ladybug table of a rig.toml: streams NAME0, NAME1, ... with one clock, called NAME.
 
     Keys: ``times`` (see :func:`~calib_toolkit_plugins.image_tables.open_cameras`) and ``heads``, a list of tables
-    with ``images``, ``camera_matrix``, and at will ``distortion`` and ``mask``. Raises DataError.
+    with ``images``, ``camera_matrix``, and at will ``distortion``, ``mask`` and a ``name``. Raises DataError.
     """
     tables.refuse_unknown(table, ["times", "heads"])
     heads = table.values.get("heads")
@@ -24,4 +24,10 @@ def open_table(table: SensorTable) -> Log:
         raise DataError(
             f"sensor {table.name} needs 'heads', a list with a table {{images = ..., camera_matrix = ...}} a head"
         )
-    return open_cameras(table, "ladybug", {f"{table.name}{k}": head for k, head in enumerate(heads)})
+    lenses = {}
+    for k, head in enumerate(heads):
+        name = head.get("name", f"{table.name}{k}")
+        if not isinstance(name, str) or name in lenses:
+            raise DataError(f"sensor {table.name}: a head is called {name!r}; give each a name of its own")
+        lenses[name] = {key: value for key, value in head.items() if key != "name"}
+    return open_cameras(table, "ladybug", lenses)

@@ -7,16 +7,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from calib_toolkit import DataError, Sensor, SensorTable, hookimpl, se3, tables
-from calib_toolkit.types import Log, MotionReading, Motions, PoseReading, Stream, Trajectory
+from calib_toolkit import DataError, Sensor, hookimpl
+from calib_toolkit.types import MotionReading, Motions, PoseReading, Stream, Trajectory
 
 Array = NDArray[np.float64]
-
-COLUMNS = {"tum": (8, 8), "euroc": (8, 17), "kitti": (12, 12)}
-"""Fewest and most columns of each format's rows."""
-KEYS = ("poses", "format", "times", "has_scale", "motion_sigma", "sigmas")
 
 NOISE_FLOOR = np.array([1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5])
 """No estimated noise of a step is believed to be below this (metres, radians)."""
@@ -100,68 +95,8 @@ def unit_translations(motions: Motions) -> Motions:
     return Motions(motions.start, motions.end, np.hstack([u, motions.vec[:, 3:]]), cov, has_scale=False)
 
 
-def open_table(table: SensorTable) -> Log:
-    """The stream of one odometry table of a rig.toml. Raises DataError.
-
-    Keys: ``poses``, ``format`` (tum, euroc or kitti), ``times`` (kitti: one stamp in seconds a line), and at will
-    ``has_scale``, ``motion_sigma`` (six numbers: metres and radians of a step; estimated where absent), ``sigmas``
-    (a file of such six numbers a row: the step that ends at the pose of that row).
-    """
-    name, values = table.name, table.values
-    tables.refuse_unknown(table, KEYS)
-    style, has_scale = values.get("format"), values.get("has_scale", True)
-    if style not in COLUMNS:
-        raise DataError(f"sensor {name}: format = {style!r} is unknown; write one of {', '.join(COLUMNS)}")
-    if not isinstance(has_scale, bool):
-        raise DataError(f"sensor {name}: has_scale must be true or false, not {has_scale!r}")
-    rows = tables.read_rows(tables.table_file(table, "poses"), *COLUMNS[style])
-    timed = _rows_beside(table, "times", rows, 1) if style == "kitti" else rows
-    ns = tables.to_nanoseconds(timed, "1e-9" if style == "euroc" else "1")
-    numbers = tables.to_numbers(rows, COLUMNS[style][0])
-    keep, notes = tables.usable_rows(ns, numbers, rows)
-    T = _poses(style, numbers[keep], [rows[i] for i in keep])
-    epoch_ns = int(ns[keep[0]])
-    stamps = tables.seconds(ns[keep], epoch_ns)
-    steps = Trajectory(stamps, T, np.zeros((len(T), 6, 6)), np.zeros((len(T), 6, 6))).motions()
-    if "sigmas" in values:
-        beside = _rows_beside(table, "sigmas", rows, 6)
-        sigmas = [_six(s, row.place) for s, row in zip(tables.to_numbers(beside, 6), beside, strict=True)]
-        moved = [MotionReading(v, np.diag(sigmas[i] ** 2)) for v, i in zip(steps.vec, keep[1:], strict=True)]
-        stream = Stream(name, "odometry", stamps, [MotionReading(None), *moved], has_scale=has_scale, notes=notes)
-        return Log(rows[0].file, {name: stream}, epoch_ns)
-    stated = values.get("motion_sigma")
-    sigma = noise_of_steps(name, steps) if stated is None else _six(stated, f"sensor {name}: motion_sigma")
-    options = {"motion_sigma": tuple(sigma.tolist())}
-    readings = [PoseReading(pose) for pose in T]
-    stream = Stream(name, "odometry", stamps, readings, None, has_scale, options=options, notes=notes)
-    return Log(rows[0].file, {name: stream}, epoch_ns)
-
-
-def _rows_beside(table: SensorTable, key: str, rows: Sequence[tables.Row], columns: int) -> list[tables.Row]:
-    others = tables.read_rows(tables.table_file(table, key), columns, columns)
-    if len(others) != len(rows):
-        raise DataError(f"{others[0].file} has {len(others)} rows and {rows[0].file} {len(rows)}; give one each")
-    return others
-
-
-def _poses(style: str, numbers: Array, rows: Sequence[tables.Row]) -> Array:
-    """(n, 4, 4) poses; refuses what is further than 1 % from a rotation, and normalises the rest."""
-    if style == "kitti":
-        M = numbers.reshape(-1, 3, 4)
-        R, t = M[:, :, :3], M[:, :, 3]
-        gram = R @ np.swapaxes(R, 1, 2) - np.eye(3)
-        bad = (np.abs(gram).max(axis=(1, 2)) > 0.02) | (np.linalg.det(R) < 0.0)
-    else:
-        t, q = numbers[:, 1:4], numbers[:, 4:8]
-        bad = np.abs(np.linalg.norm(q, axis=1) - 1.0) > 0.01
-    if bad.any():
-        what = "matrix is no rotation" if style == "kitti" else "quaternion is not of length one"
-        raise DataError(f"{rows[int(np.argmax(bad))].place}: the {what}; is format = '{style}' right?")
-    rotation = Rotation.from_matrix(R) if style == "kitti" else Rotation.from_quat(q, scalar_first=style == "euroc")
-    return se3.rigid(rotation.as_matrix(), t)
-
-
-def _six(values: Any, where: str) -> Array:
+def six_sigmas(values: Any, where: str) -> Array:
+    """(6,) stated sigmas of a step, metres and radians. Raises DataError; ``where`` begins the sentence."""
     try:
         sigma = np.asarray(values, dtype=float)
     except (TypeError, ValueError):
@@ -175,7 +110,7 @@ def _with_sigma(name: str, motions: Motions, silent: NDArray[np.bool_], stated: 
     """The motions, those that state none given that of the stated or estimated sigma."""
     if not silent.any():
         return motions
-    sigma = noise_of_steps(name, motions) if stated is None else _six(stated, f"sensor {name}: motion_sigma")
+    sigma = noise_of_steps(name, motions) if stated is None else six_sigmas(stated, f"sensor {name}: motion_sigma")
     return replace(motions, cov=np.where(silent[:, None, None], np.diag(sigma**2), motions.cov))
 
 
@@ -207,4 +142,6 @@ def _refuse(stream: Stream, frames: NDArray[np.int64], good: NDArray[np.bool_], 
 @hookimpl
 def calib_register_sensors() -> list[Sensor]:
     """Odometry; one slice holds a whole drive, since its noise is told from all of it."""
+    from calib_toolkit_plugins.odometry_tables import open_table  # which needs this module
+
     return [Sensor("odometry", estimate, OdometryOptions, open_table, chunk=1_000_000)]

@@ -2,23 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_toolkit import DataError, Motions, Sensor, SensorTable, hookimpl, se3, tables
-from calib_toolkit.types import LazyReadings, Log, Scan, Stream
-from calib_toolkit_plugins import registration
+from calib_toolkit import DataError, Motions, Sensor, Stream, hookimpl, se3
+from calib_toolkit_plugins import registration, world_frame
 from calib_toolkit_plugins.registration import Surface
+from calib_toolkit_plugins.scan_tables import open_table
 
 Array = NDArray[np.float64]
 
-KEYS = ("scans", "times", "turns")
-TURNS = {"clockwise": -1.0, "counterclockwise": 1.0}
-SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
 COARSER = 2.0
 """How many times larger the cells of the first pass are."""
 
@@ -66,8 +60,9 @@ def estimate(stream: Stream, options: VelodyneOptions) -> Motions:
     if len(stream) < 2:
         raise DataError(f"sensor {stream.name}: a motion takes two scans, and there are {len(stream)}")
     if not options.deskew or getattr(stream.readings[0], "times", None) is None:
-        return _motions(stream, _first_pass(stream, options))
-    first = _first_pass(stream, replace(options, cell=COARSER * options.cell))
+        return _motions(stream, _checked(stream, options, *_first_pass(stream, options)))
+    coarse = replace(options, cell=COARSER * options.cell)
+    first = _checked(stream, options, *_first_pass(stream, coarse))
     return _motions(stream, _second_pass(stream, options, first))
 
 
@@ -90,6 +85,7 @@ class _Sweep:
     points: Array
     times: Array | None
     options: VelodyneOptions
+    seen: Array
 
     @staticmethod
     def read(stream: Stream, k: int, options: VelodyneOptions) -> "_Sweep":
@@ -106,7 +102,8 @@ class _Sweep:
         if times is not None:
             usable &= np.isfinite(times)
             times = times[usable]
-        return _Sweep(points[usable], times if options.deskew else None, options)
+        seen = world_frame.middle_and_nearest(points)
+        return _Sweep(points[usable], times if options.deskew else None, options, seen)
 
     @property
     def enough(self) -> bool:
@@ -123,10 +120,21 @@ _Step = tuple[Array, Array] | None
 """``T_prev_curr`` and its covariance; None where it failed."""
 
 
-def _first_pass(stream: Stream, options: VelodyneOptions) -> list[_Step]:
-    """Every step from the motion before it; from nothing at the start and after a step that failed."""
+def _checked(stream: Stream, options: VelodyneOptions, steps: list[_Step], seen: Array) -> list[_Step]:
+    """The steps, unless the clouds were moved to a world frame. seen: (n, 4) of the scans."""
+    travelled = sum(float(np.linalg.norm(step[0][:3, 3])) for step in steps if step is not None)
+    world_frame.refuse_moved(stream, seen, travelled, options.max_range)
+    return steps
+
+
+def _first_pass(stream: Stream, options: VelodyneOptions) -> tuple[list[_Step], Array]:
+    """Every step from the motion before it; from nothing at the start and after a step that failed.
+
+    And where each scan lies, (n, 4), as :mod:`~calib_toolkit_plugins.world_frame` wants it.
+    """
     steps: list[_Step] = []
     prev, made, velocity = _Sweep.read(stream, 0, options), None, None
+    seen = [prev.seen]
     for k in range(1, len(stream)):
         curr, dt = _Sweep.read(stream, k, options), float(stream.stamps[k] - stream.stamps[k - 1])
         seed = None if velocity is None else se3.matrix(velocity * dt)
@@ -142,7 +150,8 @@ def _first_pass(stream: Stream, options: VelodyneOptions) -> list[_Step]:
         velocity = None if step is None else se3.vector(step[0]) / dt
         steps.append(step)
         prev = curr
-    return steps
+        seen.append(curr.seen)
+    return steps, np.array(seen)
 
 
 def _second_pass(stream: Stream, options: VelodyneOptions, first: list[_Step]) -> list[_Step]:
@@ -185,63 +194,3 @@ def _motions(stream: Stream, steps: Sequence[_Step]) -> Motions:
         return Motions(np.zeros(0), np.zeros(0), np.zeros((0, 6)), np.zeros((0, 6, 6)))
     k, T, cov = (np.array(column) for column in zip(*found, strict=True))
     return Motions(stream.stamps[k], stream.stamps[k + 1], se3.vector(T), cov)
-
-
-def open_table(table: SensorTable) -> Log:
-    """The stream of one velodyne table of a rig.toml. Raises DataError.
-
-    Keys: ``scans``, a folder of .bin (KITTI: float32 x y z intensity), .npy (n, 3 or 4), .ply or .pcd files;
-    ``times``, a file with the stamp of each, in the order of their names, as seconds or as KITTI's dates; at
-    will ``turns = "clockwise"`` (seen from above) or ``"counterclockwise"``, which gives each point its time
-    from its azimuth, the stamp being when the scanner looks along x.
-    """
-    tables.refuse_unknown(table, KEYS)
-    where, turns = f"sensor {table.name}", table.values.get("turns")
-    folder, times = tables.table_folder(table, "scans"), tables.table_file(table, "times")
-    if turns is not None and turns not in TURNS:
-        raise DataError(f"{where}: turns = {turns!r} is not known; write one of {', '.join(TURNS)}, or leave it out")
-    files = sorted(f for f in folder.iterdir() if f.suffix in SUFFIXES)
-    if not files:
-        raise DataError(f"{where}: {folder} holds no scans ({', '.join(SUFFIXES)})")
-    ns = tables.read_stamps(times)
-    if len(ns) != len(files):
-        raise DataError(f"{where}: {times} holds {len(ns)} stamps and {folder} {len(files)} scans; each needs one")
-    if tables.BLANK in ns:
-        line = ns.tolist().index(tables.BLANK) + 1
-        raise DataError(f"{where}: {times}, line {line} holds no stamp; write one, or remove it and its scan")
-    stamps = tables.seconds(ns, int(ns[0]))
-    period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
-    load = partial(_load, rate=TURNS[turns] * period / (2 * np.pi) if turns else None)
-    stream = Stream(table.name, "velodyne", stamps, LazyReadings(load, files))
-    return Log(times, {table.name: stream}, int(ns[0]))
-
-
-def _load(file: Path, rate: float | None) -> Scan:
-    """One scan file. rate: seconds per radian of azimuth, or None."""
-    try:
-        rows = _rows(file)
-    except ImportError as e:
-        raise DataError(f"{file} can not be read without Open3D ({e}); run script/setup or write .npy files") from e
-    except (OSError, ValueError) as e:
-        raise DataError(f"{file} is not a scan ({e}); write it anew or remove it with its stamp") from e
-    if rows.ndim != 2 or rows.shape[1] < 3:
-        raise DataError(f"{file} holds an array of shape {rows.shape}; a scan is (n, 3) or (n, 4)")
-    points = np.ascontiguousarray(rows[:, :3], dtype=np.float32)
-    times = None if rate is None else (rate * np.arctan2(points[:, 1], points[:, 0])).astype(np.float32)
-    return Scan(points, times, intensity=rows[:, 3].astype(np.float32) if rows.shape[1] > 3 else None)
-
-
-def _rows(file: Path) -> NDArray[Any]:
-    if file.suffix == ".bin":
-        flat = np.fromfile(file, dtype="<f4")
-        if flat.size % 4:
-            raise ValueError(f"{flat.size} numbers are not rows of four; it seems cut short")
-        return flat.reshape(-1, 4)
-    if file.suffix == ".npy":
-        return np.asarray(np.load(file, allow_pickle=False))
-    import open3d
-
-    cloud = open3d.io.read_point_cloud(file)
-    if not cloud.has_points():
-        raise ValueError("Open3D finds no points in it")
-    return np.asarray(cloud.points)

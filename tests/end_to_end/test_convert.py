@@ -16,7 +16,7 @@ from calib_toolkit.cli import main
 from calib_toolkit.plugins import registry
 from calib_toolkit.progress import Silent
 
-FORMATS = {"rosbag1": "a.bag", "rosbag2": "b", "mcap": "c.mcap", "kitti-raw": "d", "nuscenes": "e"}
+FORMATS = {"rig": "r", "rosbag1": "a.bag", "rosbag2": "b", "mcap": "c.mcap", "kitti-raw": "d", "nuscenes": "e"}
 
 
 def call(*arguments):
@@ -92,6 +92,60 @@ def test_a_killed_conversion_leaves_nothing_that_looks_whole(rig, tmp_path):
     done = call("convert", rig, tmp_path / "x", "--to", "rosbag2")
     assert done.exit_code == 0
     assert not (tmp_path / ".x.part").exists()
+
+
+def slow_drive(tmp_path, seconds):
+    """A rig of one scanner whose readings take so long each, and the plugin that reads it."""
+    plugin = tmp_path / "slow.py"
+    plugin.write_text(
+        "import time\nimport numpy as np\n"
+        "from calib_toolkit import Dataset, LazyReadings, Log, Scan, Stream, hookimpl\n"
+        f"def load(k):\n    time.sleep({seconds})\n    return Scan(np.full((5, 3), k, 'f4'))\n"
+        "def read(path, context):\n    scans = LazyReadings(load, range(40))\n"
+        "    return Log(path, {'velo': Stream('velo', 'velodyne', np.arange(40.0), scans)})\n"
+        "@hookimpl\ndef calib_register_datasets():\n"
+        "    return [Dataset('sleepy', 'a .sleepy', lambda p: p.suffix == '.sleepy', read)]\n"
+    )
+    (tmp_path / "a.sleepy").touch()
+    return plugin
+
+
+def test_a_killed_conversion_to_a_folder_goes_on(tmp_path):
+    plugin = slow_drive(tmp_path, 0.1)
+    command = ["convert", tmp_path / "a.sleepy", tmp_path / "x", "--to", "rig", "--plugin", plugin]
+    program = Path(sys.executable).with_name("calib-toolkit")
+    process = subprocess.Popen([program, *command], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    scans = tmp_path / ".x.part/x/velo/scans"
+    while not (scans / "000002.npy").exists():
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not (tmp_path / "x").exists()
+    first = (scans / "000001.npy").stat().st_mtime_ns
+    slow_drive(tmp_path, 0.0)
+    done = call(*command)
+    assert done.exit_code == 0, done.output
+    assert done.output.splitlines()[-1].endswith("40 readings read, 40 written (velo 40), 0 skipped")
+    assert (tmp_path / "x/velo/scans/000001.npy").stat().st_mtime_ns == first
+    assert not (tmp_path / ".x.part").exists()
+    assert len(open_log(tmp_path / "x").streams["velo"]) == 40
+
+
+def test_what_a_kill_left_of_another_conversion_is_removed(rig, tmp_path):
+    (tmp_path / ".x.part/x").mkdir(parents=True)
+    (tmp_path / ".x.part/plan").write_text("of another")
+    (tmp_path / ".x.part/x/stray").touch()
+    assert call("convert", rig, tmp_path / "x", "--to", "rig").exit_code == 0
+    assert sorted(p.name for p in (tmp_path / "x").iterdir()) == ["a", "b", "rig.toml"]
+
+
+def test_trajectories_are_read_as_a_folder(rig, tmp_path):
+    done = call("convert", rig, tmp_path / "t", "--to", "tum")
+    assert done.exit_code == 0, done.output
+    a, b = open_log(rig).streams["a"], open_log(tmp_path / "t").streams["a"]
+    np.testing.assert_allclose(b.stamps, a.stamps, atol=1e-9)
+    np.testing.assert_allclose(b.readings[30].T_world_sensor, a.readings[30].T_world_sensor, atol=1e-12)
 
 
 @pytest.mark.long

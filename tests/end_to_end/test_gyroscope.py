@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from calib_toolkit import Stream, calibrate_motions, se3
 from calib_toolkit.plugins import registry
-from calib_toolkit_datasets.bags.gyro import gyro_steps
+from calib_toolkit_datasets.gyro import gyro_steps
 from calib_toolkit_datasets.simulated import SimulatedSensor, measure
 from calib_toolkit_datasets.simulation.vehicle import GRID, path
 

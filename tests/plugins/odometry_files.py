@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from calib_toolkit import Motions, SensorTable, Stream, se3
 from calib_toolkit.testing import TURNING, Drive
-from calib_toolkit_plugins import odometry
+from calib_toolkit_plugins import odometry_tables
 from calib_toolkit_plugins.odometry import OdometryOptions, estimate
 
 Array = NDArray[np.float64]
@@ -60,7 +60,7 @@ def written(folder: Path, style: str, T: Sequence[Array]) -> dict[str, Any]:
 
 
 def opened(folder: Path, values: dict[str, Any]) -> Stream:
-    return odometry.open_table(SensorTable("slam", folder, values)).streams["slam"]
+    return odometry_tables.open_table(SensorTable("slam", folder, values)).streams["slam"]
 
 
 def measured(stream: Stream) -> Motions:

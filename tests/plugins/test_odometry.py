@@ -8,14 +8,14 @@ from odometry_files import PERIOD_NS, SIGMA, START_NS, integrated, measured, noi
 
 from calib_toolkit import DataError, MotionReading, Motions, PoseReading, SensorTable, Stream, Trajectory, se3
 from calib_toolkit.testing import FORWARD, STILL, TURNING, Drive
-from calib_toolkit_plugins import odometry
-from calib_toolkit_plugins.odometry import OdometryOptions, estimate, noise_of_steps, unit_translations
+from calib_toolkit_plugins import odometry_tables
+from calib_toolkit_plugins.odometry import NOISE_FLOOR, OdometryOptions, estimate, noise_of_steps, unit_translations
 
 
 @pytest.mark.parametrize("style", ["tum", "kitti", "euroc"])
 def test_poses_are_read_in_every_format_with_stamps_to_the_nanosecond(tmp_path: Path, style: str) -> None:
     T = poses(30)
-    log = odometry.open_table(SensorTable("slam", tmp_path, written(tmp_path, style, list(T))))
+    log = odometry_tables.open_table(SensorTable("slam", tmp_path, written(tmp_path, style, list(T))))
     stream = log.streams["slam"]
     assert log.epoch_ns == START_NS
     assert stream.stamps == pytest.approx(PERIOD_NS * 1e-9 * np.arange(30), abs=1e-12)
@@ -82,7 +82,7 @@ def test_the_noise_of_a_table_is_that_of_the_whole_recording_in_every_slice(tmp_
 
 def test_perfect_poses_are_not_believed_perfectly(tmp_path: Path) -> None:
     stream = opened(tmp_path, written(tmp_path, "tum", list(poses(40, STILL))))
-    assert np.sqrt(np.diag(measured(stream).cov[0])) == pytest.approx(odometry.NOISE_FLOOR)
+    assert np.sqrt(np.diag(measured(stream).cov[0])) == pytest.approx(NOISE_FLOOR)
 
 
 def test_translations_without_scale_get_length_one_and_the_spread_of_their_direction() -> None:

@@ -166,6 +166,8 @@ class Dataset:
     words, for the sentence when no reader knows a path. open: a Log whose readings stay on disk.
     write: makes such a recording of a log at a path where nothing is yet, reading by reading, and tells ``progress``
     of each; the caller moves it to where it belongs once it is whole. Raises DataError.
+    last: whether it is only asked where no other reader knows a path, since what it looks for is in others, too.
+    resumes: whether ``write`` goes on where an earlier call with the same log was stopped.
     """
 
     id: str
@@ -173,6 +175,8 @@ class Dataset:
     matches: Callable[[Path], bool]
     open: Callable[[Path, ReadContext], Log]
     write: Callable[[Log, Path, Progress], Written] | None = None
+    last: bool = False
+    resumes: bool = False
 
 
 @dataclass(frozen=True)

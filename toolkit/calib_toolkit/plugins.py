@@ -85,7 +85,9 @@ class Registry:
         """The recording at a path, by the reader named or the one that recognises it. Raises DataError."""
         path = Path(path)
         context = ReadContext(self.sensors, self.open_log, options)
-        found = [d for d in self.datasets.values() if d.matches(path)]
+        readers = sorted(self.datasets.values(), key=lambda d: d.last)
+        found = [d for d in readers if not d.last and d.matches(path)]
+        found = found or [d for d in readers if d.last and d.matches(path)]
         if not path.exists() and not found:  # a path may go on inside a recording
             raise DataError(f"{path} does not exist; name the folder or file of a recording")
         if format_id is not None:
@@ -93,7 +95,7 @@ class Registry:
                 raise DataError(f"no reader is called '{format_id}'; there are: {', '.join(self.datasets)}")
             return self.datasets[format_id].open(path, context)
         if not found:
-            wanted = "; ".join(f"{d.id} looks for {d.looks_for}" for d in self.datasets.values())
+            wanted = "; ".join(f"{d.id} looks for {d.looks_for}" for d in readers)
             raise DataError(f"no reader knows {path}: {wanted}")
         if len(found) > 1:
             raise DataError(f"{path} looks like {' and like '.join(d.id for d in found)}; choose with --format")

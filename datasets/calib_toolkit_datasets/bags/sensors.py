@@ -9,7 +9,8 @@ import numpy as np
 
 from calib_toolkit import CameraIntrinsics, LazyReadings, tables
 from calib_toolkit.errors import DataError
-from calib_toolkit_datasets.bags import clouds, gyro, images, messages, poses
+from calib_toolkit_datasets import gyro
+from calib_toolkit_datasets.bags import clouds, images, messages, poses
 from calib_toolkit_datasets.bags.clocks import Usable
 from calib_toolkit_datasets.bags.index import Bag, Key
 
@@ -25,8 +26,6 @@ KINDS = {
     poses.IMU: "odometry",
 }
 """Sensor that reads each type of message."""
-FASTEST, LARGEST_SHAKE = 100.0, 1e4
-"""Radians a second, metres a second squared: what is beyond is no measurement."""
 IMU_GAP = 200_000_000
 """Nanoseconds between Imu messages between which no attitude is told."""
 
@@ -203,17 +202,11 @@ class _Reader:
     def gyro(self, topic: str) -> Made:
         u, source = self.usable[topic], self.bag.source
         encoding = u.recorded.channel.encoding
-        if len(u.ns) < 3:
-            raise DataError("it has too few messages")
         read = [messages.load(k, source, topic, poses.IMU, encoding) for k in self.keys(topic)]
+        if read[0].angular_velocity_covariance[0] == -1:
+            raise DataError("it holds no turn rates")
         rates = np.array([[m.angular_velocity.x, m.angular_velocity.y, m.angular_velocity.z] for m in read])
-        if not np.all(np.abs(rates) < FASTEST) or read[0].angular_velocity_covariance[0] == -1 or not np.any(rates):
-            raise DataError(f"it holds no turn rates, or some beyond {FASTEST:g} rad/s")
         shakes = np.array([[m.linear_acceleration.x, m.linear_acceleration.y, m.linear_acceleration.z] for m in read])
-        shakes = np.where(np.abs(shakes) < LARGEST_SHAKE, shakes, 0.0)
-        rows, readings, bias = gyro.gyro_steps(tables.seconds(u.ns, int(u.ns[0])), rates, shakes)
-        notes = [f"{topic} tells turns alone: where the Imu sits is not determined by it, only how it is turned"]
-        if bias is None:
-            notes.append(f"{topic}: no time of rest was found, so a bias of its turn rates is not taken off")
+        rows, readings, notes = gyro.turns(topic, tables.seconds(u.ns, int(u.ns[0])), rates, shakes)
         frame = read[0].header.frame_id
-        return Made("odometry", u.ns[rows], readings, (topic,), frame, has_scale=False, notes=tuple(notes))
+        return Made("odometry", u.ns[rows], readings, (topic,), frame, has_scale=False, notes=notes)

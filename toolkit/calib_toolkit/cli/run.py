@@ -63,6 +63,7 @@ def run(
     from rich.console import Console
 
     from calib_toolkit.cli.bars import bars
+    from calib_toolkit.cli.chosen import sensor_names
     from calib_toolkit.cli.tables import show_result
     from calib_toolkit.config import Config, read_config
     from calib_toolkit.pipeline import calibrate, open_log
@@ -77,7 +78,7 @@ def run(
     if prior_file:
         config = _with_prior(config, prior_file)
     installed = registry(plugins)
-    log = open_log(drive, format_id, installed).select(_names(sensors))
+    log = open_log(drive, format_id, installed).select(sensor_names(sensors))
     file = _writable(out) if out else None
     with bars() as progress:
         result = calibrate(log, config, installed, progress, pictures=out / "overlay" if out else None)
@@ -116,12 +117,3 @@ def _writable(out: Path) -> Path:
             return file
     except OSError as e:
         raise DataError(f"{out} can not take the result ({e.strerror or e}); choose another folder with -o") from e
-
-
-def _names(sensors: str | None) -> list[str] | None:
-    if sensors is None:
-        return None
-    names = [n.strip() for n in sensors.split(",") if n.strip()]
-    if not names:
-        raise click.BadParameter("no sensor is named", param_hint="--sensors")
-    return names

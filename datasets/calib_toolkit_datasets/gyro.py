@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_toolkit import MotionReading
+from calib_toolkit.errors import DataError
 
 Array = NDArray[np.float64]
 
@@ -19,6 +20,27 @@ QUIET = 2.0
 STILL, SHAKEN = 0.02, 0.06
 """By which turn rates (rad/s) and accelerations (m/s^2) vary less at rest; driving straight on shakes."""
 LARGEST_BIAS = 0.1
+FASTEST, LARGEST_SHAKE = 100.0, 1e4
+"""Radians a second, metres a second squared: what is beyond is no measurement."""
+
+
+def turns(
+    name: str, stamps: Array, rates: Array, accelerations: Array
+) -> tuple[NDArray[np.int64], list[MotionReading], tuple[str, ...]]:
+    """Rows that are readings, the readings, and sentences on what they do not tell. Raises DataError.
+
+    Arguments as of :func:`gyro_steps`; accelerations that are no measurement count as not known.
+    """
+    if len(stamps) < 3:
+        raise DataError(f"{name} has {len(stamps)} readings of turn rates, too few; leave it out")
+    if not np.all(np.abs(rates) < FASTEST) or not np.any(rates):
+        raise DataError(f"{name} holds no turn rates, or some beyond {FASTEST:g} rad/s; leave it out")
+    usable = np.where(np.abs(accelerations) < LARGEST_SHAKE, accelerations, 0.0)
+    rows, readings, bias = gyro_steps(stamps, rates, usable)
+    notes = [f"{name} tells turns alone: where the Imu sits is not determined by it, only how it is turned"]
+    if bias is None:
+        notes.append(f"{name}: no time of rest was found, so a bias of its turn rates is not taken off")
+    return rows, readings, tuple(notes)
 
 
 def gyro_steps(
