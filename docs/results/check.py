@@ -45,11 +45,16 @@ class Trial:
 @click.option("--seeds", type=click.IntRange(0), default=20, help="Trials of the truth itself.")
 @click.option("--moves", type=click.IntRange(0), default=6, help="Trials of each size of a move.")
 @click.option("--metrics", default="im,matching,map", help="Which metrics look.")
+@click.option(
+    "--moments", type=click.IntRange(8), default=25, help="As run looks at; check looks at four times as many."
+)
 @click.option("--jobs", type=click.IntRange(1), default=2, help="Pairs at a time.")
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="Write the tables, too.")
-def main(drive: Path, calibration: Path, seeds: int, moves: int, metrics: str, jobs: int, out: Path | None) -> None:
+def main(
+    drive: Path, calibration: Path, seeds: int, moves: int, metrics: str, out: Path | None, **chosen: int
+) -> None:
     """False alarms and faults noticed."""
-    installed, config = registry(), Config(appearance=tuple(metrics.split(",")), jobs=jobs)
+    installed, config = registry(), Config(appearance=tuple(metrics.split(",")), **chosen)
     truth = read_calibration(calibration)
     log = open_log(drive).select(truth.names)
     moved = sensor_motions(log, config, installed, Silent(), default_folder())

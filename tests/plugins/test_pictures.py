@@ -174,6 +174,19 @@ def test_a_cloud_has_the_colours_of_what_it_shows(pair: Pair, tmp_path: Path) ->
     assert np.mean(np.all(colours[~on_board] == BLUE, axis=1)) > 0.97
 
 
+def test_a_cloud_is_of_scans_that_follow_each_other(pair: Pair) -> None:
+    stamps = np.arange(0.0, 10.0, 0.1)
+    lidar = replace(pair.a, stamps=stamps, readings=stamps)
+    camera = replace(pair.b, stamps=stamps[::2] - 0.2, readings=stamps[::2])
+    rows = np.array([[5, 2], [50, 25], [95, 47]])
+    drive = replace(pair, a=lidar, b=camera, dt_a_b=0.2, selected=rows)
+    close = pictures.consecutive(drive)
+    assert close.selected[:, 0].tolist() == list(range(40, 60))
+    assert np.abs(close.selected[:, 1] - close.selected[:, 0] / 2).max() <= 0.5
+    assert pictures.consecutive(drive[2:]).selected[-1, 0] == 99
+    assert pictures.consecutive(pair).selected.tolist() == [[0, 0], [1, 1]]
+
+
 def test_a_recording(pair: Pair, tmp_path: Path) -> None:
     pytest.importorskip("rerun")
     file = tmp_path / "roof-front.rrd"

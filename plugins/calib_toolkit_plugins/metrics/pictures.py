@@ -1,7 +1,7 @@
 """What a person judges a pose by: scans drawn on images before and after, and the cloud in the images' colours."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ CROP, CROP_SHAPE, FAR_SHIFT = 0.25, 0.42, 30.0
 """What is enlarged: width in widths of the image, height in its own; pixels beyond which a shift tells no more."""
 BRIGHT = 1.3  # brighter than the image gets: the white of its scale, so that points stand out
 TICKS = (4, 6, 10, 20, 40)  # metres, on the scale of colours
-GUIDE = "The right pose lays each outline of the scan on the outline of the same thing in the image."
+GUIDE = "The right pose lays each outline of the scan on that of the same thing in the image, or a beam inside it."
 
 
 def overlay(pair: Pair, poses: Mapping[str, Array], folder: Path) -> list[Path]:
@@ -53,7 +53,8 @@ def overlay(pair: Pair, poses: Mapping[str, Array], folder: Path) -> list[Path]:
 
 
 def coloured_cloud(pair: Pair, T_a_b: Array, file: Path) -> None:
-    """Write a binary PLY of up to twenty scans in the images' colours, in the lidar's frame at the first image.
+    """Write a binary PLY of some scans (see :func:`coloured`) in the images' colours, in the lidar's frame at the first
+    image.
 
     Holds what the camera sees. T_a_b: (4, 4). Raises DataError if no scan can be coloured or the file not be written.
     """
@@ -69,7 +70,8 @@ def coloured_cloud(pair: Pair, T_a_b: Array, file: Path) -> None:
 
 
 def recording(pair: Pair, T_a_b: Array, file: Path) -> None:
-    """Write a rerun recording (.rrd) of up to twenty coloured scans and their images, the camera where T_a_b has it.
+    """Write a rerun recording (.rrd) of some coloured scans (see :func:`coloured`) and their images, the camera where
+    T_a_b has it.
 
     Raises DataError if rerun is not installed or no scan can be coloured.
     """
@@ -109,10 +111,13 @@ class Coloured:
 
 
 def coloured(pair: Pair, T_a_b: Array) -> list[Coloured]:
-    """Scans spread over ``pair.selected``, as far as the motion since the first is known. Raises DataError."""
+    """Up to twenty scans that follow each other, as far as the motion since the first is known: so dense that
+    colours which run over an edge show. Raises DataError.
+    """
     found: list[Coloured] = []
-    for row in np.unique(np.linspace(0, len(pair) - 1, SWEEPS).astype(int)) if len(pair) else ():
-        moment, k = laid(pair, row), int(pair.selected[row, 1])
+    close = consecutive(pair)
+    for row in range(len(close)):
+        moment, k = laid(close, row), int(close.selected[row, 1])
         if moment is None:
             continue
         uv, shown = visible(moment, T_a_b)
@@ -125,6 +130,17 @@ def coloured(pair: Pair, T_a_b: Array) -> list[Coloured]:
     if not found:
         raise nothing_to_draw(pair)
     return found
+
+
+def consecutive(pair: Pair) -> Pair:
+    """Scans that follow each other around the middle of ``pair.selected``, each with the image nearest in time."""
+    if not len(pair):
+        return pair
+    middle = int(pair.selected[len(pair) // 2, 0])
+    first = max(min(middle - SWEEPS // 2, len(pair.a) - SWEEPS), 0)
+    scans = np.arange(first, min(first + SWEEPS, len(pair.a)))
+    apart = np.abs(pair.a.stamps[scans, None] - (pair.b.stamps + pair.dt_a_b))
+    return replace(pair, selected=np.column_stack([scans, np.argmin(apart, axis=1)]))
 
 
 def in_colour(camera: Stream, k: int) -> NDArray[np.uint8]:
