@@ -50,11 +50,9 @@ class Trial:
 )
 @click.option("--jobs", type=click.IntRange(1), default=2, help="Pairs at a time.")
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="Write the tables, too.")
-def main(
-    drive: Path, calibration: Path, seeds: int, moves: int, metrics: str, out: Path | None, **chosen: int
-) -> None:
+def main(drive: Path, calibration: Path, seeds: int, moves: int, metrics: str, out: Path | None, **more: int) -> None:
     """False alarms and faults noticed."""
-    installed, config = registry(), Config(appearance=tuple(metrics.split(",")), **chosen)
+    installed, config = registry(), Config(appearance=tuple(metrics.split(",")), **more)
     truth = read_calibration(calibration)
     log = open_log(drive).select(truth.names)
     moved = sensor_motions(log, config, installed, Silent(), default_folder())
