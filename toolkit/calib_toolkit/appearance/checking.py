@@ -3,7 +3,7 @@
 Each pair that sees the same place is compared at moments of the drive that a run would not choose. A step along one
 axis counts as better where the costs of the moments are lower by ``CLEAR`` standard errors (paired differences). How
 far to go is what a search around the given pose finds (see :mod:`~calib_toolkit.appearance.search`); of that way,
-along all axes together, a part may be clearly better where no axis alone is.
+along all axes together, a part may be clearly better where no axis alone is. So is a way of ``CLEAR`` of its own sigmas.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
