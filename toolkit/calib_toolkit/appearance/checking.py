@@ -3,7 +3,8 @@
 Each pair that sees the same place is compared at moments of the drive that a run would not choose. A step along one
 axis counts as better where the costs of the moments are lower by ``CLEAR`` standard errors (paired differences). How
 far to go is what a search around the given pose finds (see :mod:`~calib_toolkit.appearance.search`); of that way,
-along all axes together, a part may be clearly better where no axis alone is. So is a way of ``CLEAR`` of its own sigmas.
+along all axes together, a part may be clearly better where no axis alone is. An axis
+of it that is ``CLEAR`` of its own sigmas long counts by itself.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
