@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calib_toolkit import CameraIntrinsics, DataError, Motions, Pair, Scan, Stream, Transform, se3
-from calib_toolkit_plugins.metrics import pictures
+from calib_toolkit_plugins.metrics import clouds, pictures
 
 Array = NDArray[np.float64]
 
@@ -163,7 +163,7 @@ def test_a_cloud_has_the_colours_of_what_it_shows(pair: Pair, tmp_path: Path) ->
     import open3d as o3d
 
     file = tmp_path / "cloud" / "roof-front.ply"
-    pictures.coloured_cloud(pair, T_LIDAR_CAMERA, file)
+    clouds.coloured_cloud(pair, T_LIDAR_CAMERA, file)
     assert b"binary_little_endian" in file.read_bytes()[:200]
     cloud = o3d.t.io.read_point_cloud(str(file))
     points, colours = cloud.point.positions.numpy(), cloud.point.colors.numpy()
@@ -174,10 +174,23 @@ def test_a_cloud_has_the_colours_of_what_it_shows(pair: Pair, tmp_path: Path) ->
     assert np.mean(np.all(colours[~on_board] == BLUE, axis=1)) > 0.97
 
 
+def test_a_cloud_is_of_scans_that_follow_each_other(pair: Pair) -> None:
+    stamps = np.arange(0.0, 10.0, 0.1)
+    lidar = replace(pair.a, stamps=stamps, readings=stamps)
+    camera = replace(pair.b, stamps=stamps[::2] - 0.2, readings=stamps[::2])
+    rows = np.array([[5, 2], [50, 25], [95, 47]])
+    drive = replace(pair, a=lidar, b=camera, dt_a_b=0.2, selected=rows)
+    close = clouds.consecutive(drive)
+    assert close.selected[:, 0].tolist() == list(range(40, 60))
+    assert np.abs(close.selected[:, 1] - close.selected[:, 0] / 2).max() <= 0.5
+    assert clouds.consecutive(drive[2:]).selected[-1, 0] == 99
+    assert clouds.consecutive(pair).selected.tolist() == [[0, 0], [1, 1]]
+
+
 def test_a_recording(pair: Pair, tmp_path: Path) -> None:
     pytest.importorskip("rerun")
     file = tmp_path / "roof-front.rrd"
-    pictures.recording(pair, T_LIDAR_CAMERA, file)
+    clouds.recording(pair, T_LIDAR_CAMERA, file)
     assert file.read_bytes()[:3] == b"RRF"
     assert file.stat().st_size > 20_000
 
@@ -185,7 +198,7 @@ def test_a_recording(pair: Pair, tmp_path: Path) -> None:
 def test_without_rerun_it_says_how_to_get_it(pair: Pair, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(DataError, match=r"pip install calib-toolkit\[viz\]"):
-        pictures.recording(pair, T_LIDAR_CAMERA, tmp_path / "roof-front.rrd")
+        clouds.recording(pair, T_LIDAR_CAMERA, tmp_path / "roof-front.rrd")
 
 
 def test_refusals_name_the_sensors(pair: Pair, tmp_path: Path) -> None:
@@ -196,11 +209,11 @@ def test_refusals_name_the_sensors(pair: Pair, tmp_path: Path) -> None:
         with pytest.raises(DataError, match=r"roof and front: none of \d selected readings"):
             pictures.overlay(broken, {"after": T_LIDAR_CAMERA}, tmp_path)
         with pytest.raises(DataError, match=r"roof and front: none of \d selected readings"):
-            pictures.coloured_cloud(broken, T_LIDAR_CAMERA, tmp_path / "cloud.ply")
+            clouds.coloured_cloud(broken, T_LIDAR_CAMERA, tmp_path / "cloud.ply")
     with pytest.raises(DataError, match="roof and front: no pose"):
         pictures.overlay(pair, {}, tmp_path)
     with pytest.raises(DataError, match=r"must end in \.ply"):
-        pictures.coloured_cloud(pair, T_LIDAR_CAMERA, tmp_path / "cloud.txt")
+        clouds.coloured_cloud(pair, T_LIDAR_CAMERA, tmp_path / "cloud.txt")
     camera = replace(pair.b, intrinsics=None)
     with pytest.raises(DataError, match="front has no intrinsics"):
         pictures.overlay(replace(pair, b=camera), {"after": T_LIDAR_CAMERA}, tmp_path)

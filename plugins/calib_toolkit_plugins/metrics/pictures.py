@@ -1,16 +1,13 @@
-"""What a person judges a pose by: scans drawn on images before and after, and the cloud in the images' colours."""
+"""What a person judges a pose by: scans drawn on images, before and after."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from calib_toolkit import Pair, Stream, poses_at, se3
+from calib_toolkit import Pair, se3
 from calib_toolkit.errors import DataError
 from calib_toolkit_plugins.metrics.points import steps_behind
 from calib_toolkit_plugins.metrics.views import LATEST, Array, Index, Moment, ahead, moved, undistorted, usable_points
@@ -18,7 +15,6 @@ from calib_toolkit_plugins.metrics.views import LATEST, Array, Index, Moment, ah
 Part = tuple[int, int, int, int]  # left, top, width and height, pixels
 
 MOMENTS, CANDIDATES, FEWEST = 3, 4, 100  # pictures of a pair, readings looked at for each, points that one must have
-SWEEPS, THINNED = 20, 3  # scans in a cloud or recording, at most; a recording keeps one point in so many
 STEP = (0.5, 0.05)  # how much farther what is beside an edge lies, at least: metres, share of its distance
 BESIDE, HIDING = 9, 1.2  # of so many nearest in the image, a point hides what is so many times farther
 
@@ -28,7 +24,7 @@ CROP, CROP_SHAPE, FAR_SHIFT = 0.25, 0.42, 30.0
 """What is enlarged: width in widths of the image, height in its own; pixels beyond which a shift tells no more."""
 BRIGHT = 1.3  # brighter than the image gets: the white of its scale, so that points stand out
 TICKS = (4, 6, 10, 20, 40)  # metres, on the scale of colours
-GUIDE = "The right pose lays each outline of the scan on the outline of the same thing in the image."
+GUIDE = "The right pose lays each outline of the scan on that of the same thing in the image, or a beam inside it."
 
 
 def overlay(pair: Pair, poses: Mapping[str, Array], folder: Path) -> list[Path]:
@@ -50,93 +46,6 @@ def overlay(pair: Pair, poses: Mapping[str, Array], folder: Path) -> list[Path]:
         stamp = pair.b.stamps[pair.selected[row, 1]]
         draw(moment, poses, f"{pair.a.name} on {pair.b.name} at {stamp:.1f} s{differences(poses)}", files[-1])
     return files
-
-
-def coloured_cloud(pair: Pair, T_a_b: Array, file: Path) -> None:
-    """Write a binary PLY of up to twenty scans in the images' colours, in the lidar's frame at the first image.
-
-    Holds what the camera sees. T_a_b: (4, 4). Raises DataError if no scan can be coloured or the file not be written.
-    """
-    import open3d as o3d
-
-    views = coloured(pair, T_a_b)
-    points = np.concatenate([v.points @ v.T_first_now[:3, :3].T + v.T_first_now[:3, 3] for v in views])
-    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor.from_numpy(points.astype(np.float32)))
-    cloud.point.colors = o3d.core.Tensor.from_numpy(np.concatenate([v.colours for v in views]))
-    file.parent.mkdir(parents=True, exist_ok=True)
-    if not o3d.t.io.write_point_cloud(file, cloud):
-        raise DataError(f"{file} could not be written; the name must end in .ply, and the folder allow writing")
-
-
-def recording(pair: Pair, T_a_b: Array, file: Path) -> None:
-    """Write a rerun recording (.rrd) of up to twenty coloured scans and their images, the camera where T_a_b has it.
-
-    Raises DataError if rerun is not installed or no scan can be coloured.
-    """
-    try:
-        rr: Any = import_module("rerun")
-    except ImportError as error:
-        raise DataError(f"{file} can not be written without rerun: pip install calib-toolkit[viz]") from error
-    views = coloured(pair, T_a_b)
-    lidar, camera = ["world", pair.a.name], ["world", pair.a.name, pair.b.name]
-    lens = rr.Pinhole(image_from_camera=views[0].K, resolution=views[0].image.shape[1::-1], image_plane_distance=2.0)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    out = rr.RecordingStream("calib-toolkit")
-    out.save(file)
-    out.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    out.log(camera, rr.Transform3D(translation=T_a_b[:3, 3], mat3x3=T_a_b[:3, :3]), static=True)
-    out.log([*camera, "image"], lens, static=True)
-    for v in views:
-        out.set_time("drive", duration=v.stamp)
-        out.log(lidar, rr.Transform3D(translation=v.T_first_now[:3, 3], mat3x3=v.T_first_now[:3, :3]))
-        out.log([*lidar, "points"], rr.Points3D(v.points[::THINNED], colors=v.colours[::THINNED], radii=0.03))
-        out.log([*camera, "image"], rr.Image(v.image).compress(jpeg_quality=75))
-    out.disconnect()
-
-
-@dataclass(frozen=True)
-class Coloured:
-    """What a camera sees of a scan: points (n, 3), lidar frame at the image's instant ``stamp`` (s, lidar's clock),
-    with colours (n, 3) red green blue; the image (h, w, 3), undistorted. T_first_now: (4, 4), the lidar's pose.
-    """
-
-    stamp: float
-    points: Array
-    colours: NDArray[np.uint8]
-    image: NDArray[np.uint8]
-    K: Array
-    T_first_now: Array
-
-
-def coloured(pair: Pair, T_a_b: Array) -> list[Coloured]:
-    """Scans spread over ``pair.selected``, as far as the motion since the first is known. Raises DataError."""
-    found: list[Coloured] = []
-    for row in np.unique(np.linspace(0, len(pair) - 1, SWEEPS).astype(int)) if len(pair) else ():
-        moment, k = laid(pair, row), int(pair.selected[row, 1])
-        if moment is None:
-            continue
-        uv, shown = visible(moment, T_a_b)
-        now = float(pair.b.stamps[k] + pair.dt_a_b)
-        T_first_now = poses_at(pair.motion_a, [now], found[0].stamp if found else now)[0]
-        if len(shown) and np.all(np.isfinite(T_first_now)):
-            image = in_colour(pair.b, k)
-            x, y = np.round(uv).astype(int).T
-            found.append(Coloured(now, moment.points[0][shown], image[y, x], image, moment.K, T_first_now))
-    if not found:
-        raise nothing_to_draw(pair)
-    return found
-
-
-def in_colour(camera: Stream, k: int) -> NDArray[np.uint8]:
-    """(h, w, 3) red, green, blue: image k without its distortion."""
-    import cv2
-
-    image = np.asarray(camera.readings[k])
-    image = cv2.cvtColor(image, cv2.COLOR_GRAY2RGB if image.ndim == 2 else cv2.COLOR_BGR2RGB)
-    lens = camera.intrinsics
-    if lens is not None and np.any(lens.distortion):
-        image = cv2.undistort(image, lens.K, lens.distortion)
-    return np.asarray(image, np.uint8)
 
 
 def laid(pair: Pair, row: int) -> Moment | None:

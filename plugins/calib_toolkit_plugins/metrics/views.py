@@ -150,13 +150,13 @@ class LidarCamera(CostMetric):
         """
         from importlib.util import find_spec
 
-        from calib_toolkit_plugins.metrics import pictures
+        from calib_toolkit_plugins.metrics import clouds, pictures
 
         name, (*_, best) = f"{pair.a.name}-{pair.b.name}", poses.values()
         pictures.overlay(pair, poses, folder)
-        pictures.coloured_cloud(pair, best, folder / f"{name}.ply")
+        clouds.coloured_cloud(pair, best, folder / f"{name}.ply")
         if find_spec("rerun"):
-            pictures.recording(pair, best, folder / f"{name}.rrd")
+            clouds.recording(pair, best, folder / f"{name}.rrd")
 
     def prepare(self, pair: Pair, options: Any) -> Moment | None:
         """The scan and image of a row; None where the motion between them is not known."""

@@ -3,7 +3,8 @@
 Each pair that sees the same place is compared at moments of the drive that a run would not choose. A step along one
 axis counts as better where the costs of the moments are lower by ``CLEAR`` standard errors (paired differences). How
 far to go is what a search around the given pose finds (see :mod:`~calib_toolkit.appearance.search`); of that way,
-along all axes together, a part may be clearly better where no axis alone is.
+along all axes together, a part may be clearly better where no axis alone is. An axis
+of it that is ``CLEAR`` of its own sigmas long counts by itself.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from calib_toolkit import se3
 from calib_toolkit.appearance.pairs import Comparison, Moved, comparisons, select
 from calib_toolkit.appearance.refinement import chosen, options
-from calib_toolkit.appearance.search import BLURS, CLEAR, FEWEST, LEAST, OWN, Frame, estimate, focused
+from calib_toolkit.appearance.search import BLURS, CLEAR, FEWEST, LEAST, OWN, Frame, estimate, focused, prepared
 from calib_toolkit.config import Config
 from calib_toolkit.errors import CalibrationError
 from calib_toolkit.hookspecs import CostMetric
@@ -212,13 +213,14 @@ def _look(comparison: Comparison, calibration: Calibration, config: Config) -> L
     look = Look(metric.id, pair.a.name, pair.b.name, len(pair), held_out, np.nan, steps, steps, parts, one[0], one)
     values = options(metric, config)
     try:
-        found = estimate(metric, pair, values, config.seed)
+        moments = prepared(metric, pair, values) if isinstance(metric, CostMetric) else []
+        found = estimate(metric, pair, values, config.seed, moments)
         if found.converged:
             move, cov = _move(pair.prior.T_a_b, found.transform)
             late = calibration.dt_between(look.a, look.b)[1] * found.by_clock
             look = replace(look, move=move, cov=cov + np.outer(late, late))
         look = replace(look, note=found.note)
-        return _stepped(look, metric, pair, values) if isinstance(metric, CostMetric) else look
+        return _stepped(look, metric, moments, pair.prior) if isinstance(metric, CostMetric) else look
     except CalibrationError as e:
         return replace(look, note=f"{comparison.name}: {e}")
 
@@ -232,11 +234,9 @@ def _held_out(pair: Pair, config: Config) -> tuple[Pair, bool]:
     return replace(pair, selected=other), True
 
 
-def _stepped(look: Look, metric: CostMetric, pair: Pair, values: Any) -> Look:
+def _stepped(look: Look, metric: CostMetric, moments: Sequence[Any], given: Transform) -> Look:
     """The look with the costs of all steps, and of those on the way to the pose that was found."""
-    prepared = (metric.prepare(pair[k : k + 1], values) for k in range(len(pair)))
-    moments = [m for m in prepared if m is not None]
-    frame = Frame(replace(pair.prior, cov=np.diag(LEAST**2)), np.diag(LEAST))
+    frame = Frame(replace(given, cov=np.diag(LEAST**2)), np.diag(LEAST))
     cost = focused(metric, moments, frame, np.zeros(6), 1.0, BLURS[-1])
     if cost is None:
         return look

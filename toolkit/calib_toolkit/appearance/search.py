@@ -58,11 +58,17 @@ class Frame:
         return se3.rigid(se3.exp_so3(step[:, 3:]) @ T[:3, :3], T[:3, 3] + step[:, :3])
 
 
-def estimate(metric: Metric | CostMetric, pair: Pair, options: Any, seed: int = 0) -> PairEstimate:
-    """What a metric makes of a pair: by its own search if it has one, or else by this one."""
+def estimate(
+    metric: Metric | CostMetric, pair: Pair, options: Any, seed: int = 0, moments: Sequence[Any] | None = None
+) -> PairEstimate:
+    """What a metric makes of a pair: by its own search if it has one, or else by this one.
+
+    moments: those of the pair, where they are :func:`prepared` already.
+    """
     if not isinstance(metric, CostMetric):
         return metric.estimate(pair, options)
-    moments = _prepared(metric, pair, options)
+    if moments is None:
+        moments = prepared(metric, pair, options)
     if len(moments) < FEWEST:
         return _refused(metric, pair, f"only {len(moments)} of {len(pair)} moments have something to compare")
     frame = whitened(pair.prior)
@@ -91,12 +97,18 @@ def unconstrained(metric: CostMetric, pair: Pair, options: Any, seed: int = 0) -
     Compared are the points that are seen from near the prior: nobody knows others that are seen from everywhere.
     """
     frame, z = whitened(pair.prior), np.zeros(6)
-    cost = focused(metric, _prepared(metric, pair, options), frame, z, 1.0, 1.0)
+    cost = focused(metric, prepared(metric, pair, options), frame, z, 1.0, 1.0)
     if cost is None:
         return None
     wide = np.linalg.solve(frame.L, np.diag(ANYWHERE))
     best = _best(lambda z: cost(z @ wide.T), z, 1.0, ANYWHERE_ROUNDS, seed, bound=2.0)
     return np.asarray(frame.poses(wide @ best)[0], np.float64)
+
+
+def prepared(metric: CostMetric, pair: Pair, options: Any) -> list[Any]:
+    """The moments of a pair that have something to compare, each as the metric made it ready."""
+    found = (metric.prepare(pair[k : k + 1], options) for k in range(len(pair)))
+    return [m for m in found if m is not None]
 
 
 def whitened(prior: Transform) -> Frame:
@@ -105,12 +117,6 @@ def whitened(prior: Transform) -> Frame:
     wide = (axes * np.minimum(values, 1.0)) @ axes.T * np.outer(MOST, MOST)
     cov = wide + np.diag(LEAST**2)
     return Frame(replace(prior, cov=cov), np.linalg.cholesky(cov))
-
-
-def _prepared(metric: CostMetric, pair: Pair, options: Any) -> list[Any]:
-    """The moments that have something to compare."""
-    prepared = [metric.prepare(pair[k : k + 1], options) for k in range(len(pair))]
-    return [m for m in prepared if m is not None]
 
 
 def _searched(metric: CostMetric, moments: Sequence[Any], frame: Frame, seed: int) -> Evidence | None:

@@ -84,9 +84,9 @@ def check(
     console = Console(highlight=False)
     if found.judgements:
         console.print(
-            "\nHow far each metric would move the first sensor, in the axes of the second, and by how many standard"
+            "\nHow far each metric would move the first sensor, in axes of the second, and by how many standard "
+            "errors (se) that fits better where it clearly does:"
         )
-        console.print("errors (se) that fits better where it clearly does:")
         console.print(_table(found))
     alone = [f"{n}: can not be judged, for no metric sees what it and another sensor see" for n in found.alone]
     for sentence in (*(s for j in found.judgements for s in _sentences(j)), *alone, *notes):

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 from tempfile import TemporaryFile
+from time import time
 from typing import TYPE_CHECKING
 
 import click
@@ -77,17 +78,20 @@ def run(
         config = replace(config, appearance=tuple(m.strip() for m in appearance.split(",") if m.strip()))
     if prior_file:
         config = _with_prior(config, prior_file)
-    installed = registry(plugins)
+    installed, started = registry(plugins), time()
     log = open_log(drive, format_id, installed).select(sensor_names(sensors))
     file = _writable(out) if out else None
+    pictures = out / "overlay" if out else None
     with bars() as progress:
-        result = calibrate(log, config, installed, progress, pictures=out / "overlay" if out else None)
+        result = calibrate(log, config, installed, progress, pictures=pictures)
     if file is not None:
         write_result(result, file)
     span = log.trim(config.start, config.duration).span
     show_result(result, Console(highlight=False), log.reference, sum(span) / 2)
     if file is not None:
         click.echo(f"written: {file}")
+    if pictures and any(p.stat().st_mtime >= started for p in pictures.glob("*")):  # not those of an earlier run
+        click.echo(f"written: {pictures}, pictures to judge it by")
     if not result.complete:
         ctx.exit(3)
 
