@@ -20,6 +20,8 @@ SPACING, REACH = 0.4, 3
 A path's errors grow with time; those of matching are largest where a scan has hardly moved, since it samples the
 ground along rings that move with it (at 0.2 s they drew the height of an INS 2 cm towards the lidar's).
 """
+LASTING = np.radians([0.03, 0.03, 0.1])
+"""Sigma of roll, pitch and heading by which a GPS/INS is off for minutes, whatever it states: good ones' data sheets."""
 AROUND = (0.0, -1.0, 1.0, -2.0, 2.0, -4.0, 4.0)
 """Seconds from a scan of one lidar to those of the other on which it is laid."""
 
@@ -74,7 +76,9 @@ def problem_of(pair: Pair) -> Problem:
     by_dt = (0.0, 1.0) if two else (-1.0, -1.0) if inverted else (1.0, 1.0)
     links = _links(motion, targets, sources, readings, group, by_dt)
     known = np.asarray(np.isfinite(links.T_path + links.T_late).all(axis=(1, 2)))
-    return Problem(motion, targets, sources, readings, links, T, cov, inverted, _attitude(path))[known]
+    ins = (pair.b if inverted else pair.a).kind == "gps_ins"
+    lasting = _attitude(path) + np.diag(LASTING**2) * ins
+    return Problem(motion, targets, sources, readings, links, T, cov, inverted, lasting)[known]
 
 
 def _attitude(path: Motions | Trajectory) -> Array:
