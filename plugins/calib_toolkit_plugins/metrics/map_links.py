@@ -21,7 +21,7 @@ A path's errors grow with time; those of matching are largest where a scan has h
 ground along rings that move with it (at 0.2 s they drew the height of an INS 2 cm towards the lidar's).
 """
 LASTING = np.radians([0.03, 0.03, 0.1])
-"""Sigma of roll, pitch and heading by which a GPS/INS is off for minutes, whatever it states: good ones' data sheets."""
+"""Sigma of roll, pitch and heading by which a good GPS/INS is off for minutes, whatever it states (data sheets)."""
 AROUND = (0.0, -1.0, 1.0, -2.0, 2.0, -4.0, 4.0)
 """Seconds from a scan of one lidar to those of the other on which it is laid."""
 
