@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from calib_toolkit import DataError, Motions, NoOptions, Pair, Scan, Stream, Trajectory, Transform, se3
 from calib_toolkit_plugins.metrics.map import Map
+from calib_toolkit_plugins.metrics.map_scans import Sweep, misfit, straighten
 
 Array = NDArray[np.float64]
 
@@ -204,6 +205,23 @@ def test_two_lidars_that_look_apart_meet_in_the_map(rig):
     assert np.all(np.abs(e[:3]) < 0.02)
     assert np.all(np.abs(e[3:]) < np.radians(0.1))
     assert np.all(np.abs(e) < 4 * np.sqrt(np.diag(found.transform.cov)))
+
+
+def patch(first: float, last: float, height: float, seed: int) -> Sweep:
+    """Level ground from ``first`` to ``last`` metres ahead, 20 m wide."""
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform([first, -10.0], [last, 10.0], (8000, 2))
+    points = np.column_stack([xy, height + 0.01 * rng.standard_normal(len(xy))])
+    return Sweep(points.astype(np.float32), np.full(len(xy), 1.0), 1.0)
+
+
+@pytest.mark.parametrize(("first", "seen_twice"), [(4.0, True), (10.1, False)])
+def test_ground_that_only_adjoins_is_not_seen_twice(first, seen_twice):
+    _, steps = motion(np.eye(4), 10.0, 1.0, 0.0)
+    near = straighten(patch(2.0, 10.0, -1.5, 1), steps, np.eye(4))
+    far = straighten(patch(first, 18.0, -1.4, 2), steps, np.eye(4))
+    found = misfit(near, far, np.eye(4), 0.5)
+    assert (found is not None) == seen_twice
 
 
 def test_lidars_whose_scans_lie_far_apart_do_not_overlap(rig):

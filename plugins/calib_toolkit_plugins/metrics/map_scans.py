@@ -26,6 +26,9 @@ NEIGHBOURS = 12
 THICK, WIDE = 0.06, 0.1
 """They may be scattered this far across the plane, metres, and must spread within it in two directions: this is the
 least ratio of their variances."""
+EDGE = 0.5
+"""Where the mean of a point's neighbours lies farther from it than this share of their spread, the plane ends: what is
+nearest to it there may belong to what lies beyond, and was not seen twice."""
 IN_COMMON = 50
 """Matches, with fewer of which two scans show nothing of each other."""
 ALIKE = 0.9
@@ -103,13 +106,16 @@ def straighten(sweep: Sweep, motion: Motions, T_path_lidar: Array) -> Surface | 
 
 
 def _planes(surface: Surface) -> Surface:
-    """The surface with normals only where neighbours lie on a plane, and not in a line along one ring."""
+    """The surface with normals only within a plane: neighbours on all sides, and not in a line along one ring."""
     rows, _ = surface.tree.batch_knn_search(surface.points, NEIGHBOURS)
     around = surface.points[np.minimum(rows, len(surface.points) - 1)]
-    offset = around - around.mean(axis=1, keepdims=True)
+    centre = around.mean(axis=1)
+    offset = around - centre[:, None]
     variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset) / NEIGHBOURS)
     flat = (variance[:, 0] < THICK**2) & (variance[:, 1] > WIDE * variance[:, 2])
-    return replace(surface, normals=axes[:, :, 0] * flat[:, None])
+    aside = np.einsum("ni,ni->n", surface.points - centre, surface.points - centre)
+    inside = aside < EDGE**2 * variance.sum(axis=1)
+    return replace(surface, normals=axes[:, :, 0] * (flat & inside)[:, None])
 
 
 def misfit(target: Surface, source: Surface, T_target_source: Array, gate: float) -> Misfit | None:
