@@ -48,6 +48,7 @@ class Map:
 
     id = "map"
     options: type = NoOptions
+    version = "2"
 
     def accepts(self, kind_a: str, kind_b: str) -> bool:
         """Whether one is a lidar, and the other a lidar or a sensor of poses."""
