@@ -27,8 +27,8 @@ THICK, WIDE = 0.06, 0.1
 """They may be scattered this far across the plane, metres, and must spread within it in two directions: this is the
 least ratio of their variances."""
 EDGE = 0.5
-"""Where the mean of a point's neighbours lies farther from it than this share of their spread, the plane ends: what is
-nearest to it there may belong to what lies beyond, and was not seen twice."""
+"""Where the mean of a point's neighbours lies farther from it than this share of their spread, the plane ends: what
+is nearest to it there may belong to what lies beyond, and was not seen twice."""
 IN_COMMON = 50
 """Matches, with fewer of which two scans show nothing of each other."""
 ALIKE = 0.9
