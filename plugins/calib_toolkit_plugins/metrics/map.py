@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from calib_toolkit import NoOptions, Pair, PairEstimate, Transform, hookimpl, se3
 from calib_toolkit_plugins.metrics.map_links import Problem, problem_of
-from calib_toolkit_plugins.metrics.map_scans import Sweep, covered, misfit, read_sweep, straighten
+from calib_toolkit_plugins.metrics.map_scans import Patch, Sweep, covered, misfit, read_sweep, straighten
 from calib_toolkit_plugins.metrics.map_solve import LATE, Equations, State, equations, freed, moved, stepped
-from calib_toolkit_plugins.registration import Surface
 
 Array = NDArray[np.float64]
 
@@ -40,7 +39,7 @@ MATCHING = np.repeat([1e-3, np.radians(0.01)], 3)
 SHARED = 0.1
 """Share of the points of one lidar that must find surfaces of the other."""
 
-Surfaces = Mapping[tuple[str, int], Surface]
+Surfaces = Mapping[tuple[str, int], Patch]
 
 
 class Map:

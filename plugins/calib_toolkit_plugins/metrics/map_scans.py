@@ -1,6 +1,6 @@
 """Scans laid along a path: straightened by it, and how far apart their surfaces then lie."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +72,13 @@ class Misfit:
     rms: float
 
 
+@dataclass(frozen=True)
+class Patch(Surface):
+    """A surface with normals of zero where neighbours lie on no plane. inside: (n,) points with some on all sides."""
+
+    inside: NDArray[np.bool_]
+
+
 def read_sweep(track: Track, k: int) -> Sweep | None:
     """Reading k of a lidar; None if too little of it can be used. Raises DataError."""
     scan = track.stream.readings[k]
@@ -89,7 +96,7 @@ def read_sweep(track: Track, k: int) -> Sweep | None:
     return Sweep(points[usable], stamp + times[usable], stamp) if len(usable) >= FEWEST else None
 
 
-def straighten(sweep: Sweep, motion: Motions, T_path_lidar: Array) -> Surface | None:
+def straighten(sweep: Sweep, motion: Motions, T_path_lidar: Array) -> Patch | None:
     """What a scan saw, as from where the lidar was at its stamp; None where the path is not known."""
     first, last = float(sweep.times.min()), float(sweep.times.max())
     knots = np.linspace(first, last, max(2, int(np.ceil((last - first) / KNOT)) + 1))
@@ -105,8 +112,8 @@ def straighten(sweep: Sweep, motion: Motions, T_path_lidar: Array) -> Surface | 
     return _planes(registration.surface((1 - part) * before + part * after, CELL))
 
 
-def _planes(surface: Surface) -> Surface:
-    """The surface with normals only within a plane: neighbours on all sides, and not in a line along one ring."""
+def _planes(surface: Surface) -> Patch:
+    """The surface with normals only where neighbours lie on a plane, and not in a line along one ring."""
     rows, _ = surface.tree.batch_knn_search(surface.points, NEIGHBOURS)
     around = surface.points[np.minimum(rows, len(surface.points) - 1)]
     centre = around.mean(axis=1)
@@ -115,10 +122,10 @@ def _planes(surface: Surface) -> Surface:
     flat = (variance[:, 0] < THICK**2) & (variance[:, 1] > WIDE * variance[:, 2])
     aside = np.einsum("ni,ni->n", surface.points - centre, surface.points - centre)
     inside = aside < EDGE**2 * variance.sum(axis=1)
-    return replace(surface, normals=axes[:, :, 0] * (flat & inside)[:, None])
+    return Patch(surface.points, axes[:, :, 0] * flat[:, None], surface.cloud, surface.tree, inside)
 
 
-def misfit(target: Surface, source: Surface, T_target_source: Array, gate: float) -> Misfit | None:
+def misfit(target: Patch, source: Patch, T_target_source: Array, gate: float) -> Misfit | None:
     """How far the points of one scan lie off the surfaces of another, at a motion; None if hardly any is near one.
 
     Only points within ``gate`` metres of the other scan count, and the farther off a surface, the less (Tukey's
@@ -129,7 +136,8 @@ def misfit(target: Surface, source: Surface, T_target_source: Array, gate: float
     points, facing = (v[flat] @ T_target_source[:3, :3].T for v in (source.points, source.normals))
     rows, squared = target.tree.batch_knn_search(points + T_target_source[:3, 3], 1)
     planes = np.minimum(rows[:, 0], len(target.points) - 1).astype(np.int64)
-    near = (squared[:, 0] < gate**2) & (np.abs(np.einsum("ij,ij->i", target.normals[planes], facing)) > ALIKE)
+    near = (squared[:, 0] < gate**2) & target.inside[planes]
+    near &= np.abs(np.einsum("ij,ij->i", target.normals[planes], facing)) > ALIKE
     if near.sum() < IN_COMMON:
         return None
     normals, lever = target.normals[planes[near]], points[near]
@@ -142,7 +150,7 @@ def misfit(target: Surface, source: Surface, T_target_source: Array, gate: float
     return Misfit(J.T @ weighted, weighted.T @ errors, float(np.sqrt(variance)))
 
 
-def covered(target: Surface, source: Surface, T_target_source: Array, gate: float) -> float:
+def covered(target: Patch, source: Patch, T_target_source: Array, gate: float) -> float:
     """Share of the points of one scan that lie within ``gate`` metres of another's."""
     points = source.points[:: max(1, len(source.points) // MATCHES)]
     _, squared = target.tree.batch_knn_search(points @ T_target_source[:3, :3].T + T_target_source[:3, 3], 1)

@@ -20,8 +20,8 @@ FREEDOM = 5.0
 FLOOR = np.array([1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5])
 """No error of a path is taken to be smaller than this between two scans (metres, radians)."""
 
-LATE = 2e-3
-"""Seconds, for the derivative by the clock offset."""
+LATE = 1e-2
+"""Seconds, for the derivative by the clock offset; with less, points that change their match are felt."""
 LASTING = 5e-4
 """Radians: what a run's attitude error is taken for at first."""
 
