@@ -51,9 +51,10 @@ def to_message(scan: Scan, header: Any, types: Any) -> Any:
     for name, _, values in fields:
         table[name] = values
     numbers = {f"<{kind}": number for number, kind in TYPES.items()}
+    sizes = np.array([np.dtype(kind).itemsize for _, kind, _ in fields])
     described = [
-        types["sensor_msgs/msg/PointField"](name, table.dtype.fields[name][1], numbers[kind], 1)  # type: ignore[index]
-        for name, kind, _ in fields
+        types["sensor_msgs/msg/PointField"](name, offset, numbers[kind], 1)
+        for (name, kind, _), offset in zip(fields, (np.cumsum(sizes) - sizes).tolist(), strict=True)
     ]
     size, data = table.dtype.itemsize, np.frombuffer(table.tobytes(), dtype=np.uint8)
     return types[KIND](header, 1, len(table), described, False, size, size * len(table), data, True)
