@@ -30,12 +30,14 @@ class GpsInsOptions:
     """What is believed of a fix that does not state its own accuracy, and what counts as a jump.
 
     sigma_position: metres, each axis. sigma_rpy_deg: degrees, each angle (0.01 is what the paper's author took for
-    KITTI, 0.03 for Shrimp). samples: draws of the Monte-Carlo conversion. max_speed: metres per second; a
-    faster step is a jump of the position solution.
+    KITTI, 0.03 for Shrimp). lean_deg: by how much roll, pitch and heading are off for minutes at least, whatever the
+    fixes state (data sheets of good receivers). samples: draws of the Monte-Carlo conversion. max_speed: metres per
+    second; a faster step is a jump of the position solution.
     """
 
     sigma_position: float = 0.05
     sigma_rpy_deg: float = 0.01
+    lean_deg: tuple[float, float, float] = (0.03, 0.03, 0.1)
     samples: int = 100
     max_speed: float = 100.0
 
@@ -65,7 +67,8 @@ def estimate(stream: Stream, options: GpsInsOptions) -> Trajectory:
     step = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
     jump = np.where(step > options.max_speed * np.diff(stream.stamps), step, 0.0)
     drift[1:, :3, :3] = jump[:, None, None] ** 2 * np.eye(3)
-    return Trajectory(stream.stamps, T, cov, drift, has_attitude=not alone)
+    lean = np.maximum(np.median(sigma[:, 3:], axis=0), np.radians(options.lean_deg))
+    return Trajectory(stream.stamps, T, cov, drift, has_attitude=not alone, lean=lean)
 
 
 def ecef(lat: Array, lon: Array, alt: Array) -> Array:
@@ -179,4 +182,4 @@ def _to_world(R_world_enu: Array, cov: Array) -> Array:
 @hookimpl
 def calib_register_sensors() -> list[Sensor]:
     """GPS/INS, whatever the receiver."""
-    return [Sensor("gps_ins", estimate, GpsInsOptions, open_table, chunk=1000)]
+    return [Sensor("gps_ins", estimate, GpsInsOptions, open_table, chunk=1000, version="2")]

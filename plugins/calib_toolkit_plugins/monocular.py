@@ -26,21 +26,23 @@ UNKNOWN_DIRECTION_VAR = 1.0  # rad^2 in the tangent plane: as good as the whole 
 class MonocularOptions:
     """corners: at most so many, no two closer than ``spacing`` pixels. window: of the flow, pixels; levels: of its
     pyramid. forward_backward: how far a corner may land from itself when followed there and back, pixels.
-    point_sigma: noise of a corner in each image, pixels (the paper's author: 0.5).
+    point_sigma: noise of a corner in each image, pixels (the paper's author: 0.5). centre_sigma: of the principal
+    point, pixels, by which all directions of travel lean.
     """
 
     corners: int = 800
     spacing: float = 10.0
-    window: int = 15
+    window: int = 11
     levels: int = 4
     forward_backward: float = 1.0
     point_sigma: float = 0.5
+    centre_sigma: float = 0.3
 
 
 @hookimpl
 def calib_register_sensors() -> list[Sensor]:
     """The ``monocular`` sensor."""
-    return [Sensor("monocular", estimate, MonocularOptions, open_table)]
+    return [Sensor("monocular", estimate, MonocularOptions, open_table, version="2")]
 
 
 def open_table(table: SensorTable) -> Log:
@@ -76,7 +78,8 @@ def estimate(stream: Stream, options: MonocularOptions) -> Motions:
     if not steps:
         return Motions(np.zeros(0), np.zeros(0), np.zeros((0, 6)), np.zeros((0, 6, 6)), has_scale=False)
     start, end, vec, cov = (np.array(column) for column in zip(*steps, strict=True))
-    return Motions(start, end, vec, cov, has_scale=False)
+    f = np.array([camera.K[1, 1], camera.K[0, 0], np.inf])
+    return Motions(start, end, vec, cov, has_scale=False, lean=np.arctan(options.centre_sigma / f))
 
 
 def normalise(pixels: Array, camera: CameraIntrinsics, sigma: float) -> tuple[Points, NDArray[np.bool_]]:
@@ -199,7 +202,10 @@ def _edges(length: int, parts: int) -> tuple[list[int], list[int]]:
 
 
 def _track(a: _View, b: _View, camera: CameraIntrinsics, options: MonocularOptions) -> tuple[Array, Array]:
-    """Pixels (n, 2) of corners of a, and where they are in b: followed there and back, inside image and mask."""
+    """Pixels (n, 2) of a, and where they are in b: corners followed there and back, inside image and mask.
+
+    Where the flow changes within a window, what is followed is the middle of the window's gradients.
+    """
     import cv2
 
     if not len(a.corners):
@@ -215,13 +221,33 @@ def _track(a: _View, b: _View, camera: CameraIntrinsics, options: MonocularOptio
     p, q = start.reshape(-1, 2).astype(np.float64), there.reshape(-1, 2).astype(np.float64)
     keep = (seen.ravel() > 0) & (seen_back.ravel() > 0)
     keep &= np.linalg.norm(back.reshape(-1, 2) - p, axis=1) <= options.forward_backward
+    aside = _middles(a.grey, p[keep], options.window // 2)
+    p, q = p[keep] + aside, q[keep] + aside
     h, w = b.grey.shape
-    keep &= np.all((q >= 0) & (q <= [w - 1, h - 1]), axis=1)
-    p, q = p[keep], q[keep]
+    inside = np.all((q >= 0) & (q <= [w - 1, h - 1]), axis=1)
+    p, q = p[inside], q[inside]
     if camera.mask is not None:
         column, row = np.rint(q).astype(int).T
         p, q = p[camera.mask[row, column] > 0], q[camera.mask[row, column] > 0]
     return p, q
+
+
+def _middles(grey: Image, p: Array, reach: int) -> Array:
+    """(n, 2) pixels from p (n, 2) to where the gradients within ``reach`` meet: ``sum(g g^T (x - p)) = 0``.
+
+    Foerstner & Guelch, "A fast operator for detection and precise location of distinct points", 1987.
+    """
+    import cv2
+
+    u, v = np.meshgrid(*[np.arange(-reach, reach + 1)] * 2)
+    column, row = np.rint(p).astype(int).T[:, :, None]
+    padded = cv2.copyMakeBorder(grey, reach, reach, reach, reach, cv2.BORDER_REPLICATE)
+    there = row + v.ravel() + reach, column + u.ravel() + reach
+    g = np.stack([cv2.Scharr(padded, cv2.CV_32F, *d)[there].astype(float) for d in ((1, 0), (0, 1))], axis=2)
+    x = np.stack([column + u.ravel() - p[:, :1], row + v.ravel() - p[:, 1:]], axis=2)
+    weight, moment = np.einsum("nki,nkj->nij", g, g), np.einsum("nki,nkj,nkj->ni", g, g, x)
+    aside = (np.linalg.pinv(weight, hermitian=True) @ moment[..., None])[..., 0]
+    return np.where(np.abs(aside).max(axis=1, keepdims=True) < reach, aside, 0.0)
 
 
 def _motion(a: _View, b: _View, camera: CameraIntrinsics, options: MonocularOptions) -> TwoViewMotion | None:

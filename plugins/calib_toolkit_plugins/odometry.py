@@ -92,7 +92,7 @@ def unit_translations(motions: Motions) -> Motions:
     cov[vague, :3, :] = cov[vague, :, :3] = 0.0
     cov[vague, :3, :3] = tangent[vague]
     cov[zero, :3, :3] = np.eye(3)
-    return Motions(motions.start, motions.end, np.hstack([u, motions.vec[:, 3:]]), cov, has_scale=False)
+    return replace(motions, vec=np.hstack([u, motions.vec[:, 3:]]), cov=cov, has_scale=False)
 
 
 def six_sigmas(values: Any, where: str) -> Array:

@@ -13,6 +13,11 @@ from calib_toolkit_plugins.scan_tables import open_table
 
 Array = NDArray[np.float64]
 
+LEAN = float(np.radians(0.02))
+"""By which a lidar's own calibration, and surfaces seen at a slant, turn its travel."""
+LATE = 0.006
+"""Of a sweep, by which motion seems late: what is seen ahead is not seen when what is seen behind is, so that the
+instant at which a sweep shows roll and pitch depends on where there is something to see."""
 COARSER = 2.0
 """How many times larger the cells of the first pass are."""
 
@@ -46,7 +51,7 @@ class VelodyneOptions:
 @hookimpl
 def calib_register_sensors() -> list[Sensor]:
     """The ``velodyne`` sensor."""
-    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="3")]
+    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="4")]
 
 
 def estimate(stream: Stream, options: VelodyneOptions) -> Motions:
@@ -193,4 +198,5 @@ def _motions(stream: Stream, steps: Sequence[_Step]) -> Motions:
     if not found:
         return Motions(np.zeros(0), np.zeros(0), np.zeros((0, 6)), np.zeros((0, 6, 6)))
     k, T, cov = (np.array(column) for column in zip(*found, strict=True))
-    return Motions(stream.stamps[k], stream.stamps[k + 1], se3.vector(T), cov)
+    start, end = stream.stamps[k], stream.stamps[k + 1]
+    return Motions(start, end, se3.vector(T), cov, lean=np.full(3, LEAN), late=LATE * stream.period)

@@ -112,5 +112,5 @@ def test_travel_is_never_turned_about_itself():
         R_base_sensor=turn @ there.T_base_sensor[:, :3, :3], cov=np.radians(0.1) ** 2 * np.eye(3)
     )
     nothing = [np.zeros((6, 0))]
-    (about,) = leaning.axes(by_turns, nothing, nothing, there, np.array([8.0, 0.0, 0.0]))
+    (about,) = leaning.axes(by_turns, np.zeros((3, 3)), nothing, nothing, there, np.array([8.0, 0.0, 0.0]))
     assert_allclose(np.abs(about.T), [[0.0, 1.0, 0.0]], atol=1e-9)

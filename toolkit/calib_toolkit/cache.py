@@ -16,7 +16,7 @@ import numpy as np
 
 from calib_toolkit.types import LazyReadings, Motions, PairEstimate, Trajectory, Transform
 
-FORMAT = 1
+FORMAT = 2
 """Raised when what is stored changes shape."""
 
 
@@ -40,7 +40,7 @@ def load(folder: Path, key: str) -> tuple[Motions | Trajectory, tuple[str, ...]]
             kinds: dict[str, type[Motions] | type[Trajectory]] = {"Motions": Motions, "Trajectory": Trajectory}
             kind = kinds[str(stored["kind"])]
             values = {f.name: stored[f.name] for f in fields(kind)}
-            values |= {name: bool(values[name]) for name in ("has_scale", "has_attitude") if name in values}
+            values |= {name: values[name].item() for name in values if values[name].ndim == 0}
             return kind(**values), tuple(str(n) for n in stored["notes"])
     except Exception:  # whatever a damaged file makes of itself, the motion can be estimated again
         return None

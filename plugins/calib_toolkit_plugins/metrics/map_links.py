@@ -20,8 +20,6 @@ SPACING, REACH = 0.4, 3
 A path's errors grow with time; those of matching are largest where a scan has hardly moved, since it samples the
 ground along rings that move with it (at 0.2 s they drew the height of an INS 2 cm towards the lidar's).
 """
-LASTING = np.radians([0.03, 0.03, 0.1])
-"""Sigma of roll, pitch and heading by which a good GPS/INS is off for minutes, whatever it states (data sheets)."""
 AROUND = (0.0, -1.0, 1.0, -2.0, 2.0, -4.0, 4.0)
 """Seconds from a scan of one lidar to those of the other on which it is laid."""
 
@@ -76,18 +74,16 @@ def problem_of(pair: Pair) -> Problem:
     by_dt = (0.0, 1.0) if two else (-1.0, -1.0) if inverted else (1.0, 1.0)
     links = _links(motion, targets, sources, readings, group, by_dt)
     known = np.asarray(np.isfinite(links.T_path + links.T_late).all(axis=(1, 2)))
-    ins = (pair.b if inverted else pair.a).kind == "gps_ins"
-    lasting = _attitude(path) + np.diag(LASTING**2) * ins
-    return Problem(motion, targets, sources, readings, links, T, cov, inverted, lasting)[known]
+    return Problem(motion, targets, sources, readings, links, T, cov, inverted, _attitude(path))[known]
 
 
 def _attitude(path: Motions | Trajectory) -> Array:
-    """What a trajectory states of its attitude, as if all of it lasted: an INS's heading is off for minutes, which
-    no drive tells from the mount."""
+    """What lasts of a trajectory's attitude, and what it states as if all of that lasted: an INS's heading is off for
+    minutes, which no drive tells from the mount."""
     if isinstance(path, Motions):
         return np.zeros((3, 3))
     R_sensor_world = np.swapaxes(path.T_world_sensor[:, :3, :3], 1, 2)
-    return np.asarray(np.median(se3.rotate_cov(R_sensor_world, path.cov[:, 3:, 3:]), axis=0))
+    return np.asarray(np.diag(path.lean**2) + np.median(se3.rotate_cov(R_sensor_world, path.cov[:, 3:, 3:]), axis=0))
 
 
 def _runs(track: Track, centres: Indices) -> tuple[Indices, Indices]:

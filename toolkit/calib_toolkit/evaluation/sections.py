@@ -111,7 +111,13 @@ def _part(moved: Motions | Trajectory, first: float, last: float) -> Motions | T
     there = (moved.stamps >= first) & (moved.stamps <= last)
     drift = moved.drift[there]
     drift[:1] = 0.0
-    return Trajectory(moved.stamps[there], moved.T_world_sensor[there], moved.cov[there], drift)
+    return replace(
+        moved,
+        stamps=moved.stamps[there],
+        T_world_sensor=moved.T_world_sensor[there],
+        cov=moved.cov[there],
+        drift=drift,
+    )
 
 
 def _lasting(drive: Drive) -> float:

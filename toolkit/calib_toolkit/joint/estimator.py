@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, null_space
+from scipy.linalg import block_diag, null_space, orth
 
 from calib_toolkit import assembly, checks, observability, se3, sync
 from calib_toolkit.config import Config
@@ -141,13 +141,14 @@ def _place(timed: Timed, known: Sequence[Measured]) -> Placed:
         timed.motions,
         clocks=timed.clocks,
         turn_scale=timed.turned.scale,
-        prior=lambda T: prior.information(T, names, known),
     )
-    found = search(T=T, free=_free(open_, [np.zeros((3, 0))] * len(open_)))
+    lean = leaning.stated(timed.motions, timed.turned.R_base_sensor)
+    found = search(T=T, free=_free(open_, lean), prior=_prior(names, known, lean))
     ahead = np.sum(timed.steps.vec[0, :, :3], axis=0)
-    leans = leaning.axes(timed.turned, open_, verdict.untold(_unscaled(timed.steps), timed.T), found, ahead)
+    leans = leaning.axes(timed.turned, lean, open_, verdict.untold(_unscaled(timed.steps), timed.T), found, ahead)
     if any(axes.size for axes in leans):
-        found = search(T=found.T_base_sensor, free=_free(open_, leans))
+        lean = lean + leaning.BIASED**2 * block_diag(*(axes @ axes.T for axes in leans))
+        found = search(T=found.T_base_sensor, free=_free(open_, lean), prior=_prior(names, known, lean))
     cov, gain = spread.covariance(found.information, found.feigned, found.free)
     cov = cov + leaning.doubt(timed.turned, found, leans, ahead)
     stamps = [timed.clocks.base_time(i, m.start) for i, m in enumerate(timed.motions)]
@@ -212,12 +213,23 @@ def _offsets(timed: Timed) -> Calibration:
     return replace(found, determined=known)
 
 
-def _free(open_: Sequence[Array], biased: Sequence[Array]) -> Array:
+def _free(open_: Sequence[Array], lean: Array) -> Array:
     """(9(n-1), k) orthonormal directions in which poses and biases may move. open_: (6, j) of poses, in
-    ``verdict.UNITS``. biased: (3, j) of biases.
+    ``verdict.UNITS``. lean: (3(n-1), 3(n-1)) covariance of the biases.
     """
     poses = [null_space((v / verdict.UNITS[:, None]).T) for v in open_]
-    return block_diag(*poses, *biased)
+    return block_diag(*poses, orth(lean))
+
+
+def _prior(names: Sequence[str], known: Sequence[Measured], lean: Array) -> moving.Prior:
+    """Measured numbers, and biases that are zero within their covariance."""
+    upright = np.linalg.pinv(lean, hermitian=True)
+
+    def told(T: Array, bias: Array) -> tuple[Array, Array]:
+        information, pull = prior.information(T, names, known)
+        return block_diag(information, upright), np.concatenate([pull, -upright @ bias[1:].ravel()])
+
+    return told
 
 
 def _unscaled(steps: sync.Steps) -> sync.Steps:

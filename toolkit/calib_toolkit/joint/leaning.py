@@ -4,42 +4,55 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import null_space
+from scipy.linalg import block_diag, null_space
 
 from calib_toolkit import se3
 from calib_toolkit.joint import verdict
 from calib_toolkit.joint.moving import Moving
 from calib_toolkit.joint.turning import Turning
+from calib_toolkit.types import Motions
 
 Array = NDArray[np.float64]
 
 SURE = 3.5
 """Sigma by which a sensor's turns and travel must disagree before they are not believed together."""
+BIASED = 0.05
+"""Radians by which travel may be turned about an axis about which they disagree."""
 MOST = float(np.radians(1.5))
 """Travel is never turned further than this: then it is the turns that are wrong."""
 USUAL = float(np.radians(0.5))
 """Sigma of what travel is turned by, as far as recordings show, where the turns are no help to tell."""
 
 
-def axes(
-    turned: Turning, open_: Sequence[Array], by_turns: Sequence[Array], found: Moving, ahead: Array
-) -> list[Array]:
-    """For each sensor but the base, axes (3, j) about which its turns alone say something else than its travel too.
+def stated(motions: Sequence[Motions], R: Array) -> Array:
+    """(3(n-1), 3(n-1)) of what each travel is turned by against its turns and against the base's, base axes.
 
-    open_, by_turns: (6, k) directions of each pose that nothing tells, and that turns do not. ahead: (3,) where the
-    base went: a travel that is turned about itself looks the same, so all axes lie across it.
+    By what the sensors state of it: the base's own fault is shared by all. R: (n, 3, 3) of the poses.
+    """
+    base, *others = (axes * m.lean**2 @ axes.T for m, axes in zip(motions, R, strict=True))
+    return np.asarray(block_diag(*others) + np.tile(base, (len(others), len(others))))
+
+
+def axes(
+    turned: Turning, lean: Array, open_: Sequence[Array], by_turns: Sequence[Array], found: Moving, ahead: Array
+) -> list[Array]:
+    """For each sensor but the base, axes (3, j) about which its turns alone say something else than its travel.
+
+    lean: (3(n-1), 3(n-1)) as :func:`stated`. open_, by_turns: (6, k) directions of each pose that nothing tells, and
+    that turns do not. ahead: (3,) where the base went: a travel that is turned about itself looks the same, so all
+    axes lie across it.
     """
     axes = []
     for k, (directions, unturned) in enumerate(zip(open_, by_turns, strict=True)):
-        R = found.T_base_sensor[k + 1, :3, :3], turned.R_base_sensor[k + 1]
-        apart = se3.log_so3(R[1] @ R[0].T)
+        R, own = (found.T_base_sensor[k + 1, :3, :3], turned.R_base_sensor[k + 1]), slice(3 * k, 3 * k + 3)
+        apart = se3.log_so3(R[1] @ R[0].T) + found.bias[k + 1]
         # what nothing told, or turns do not, may lie anywhere
         anywhere = np.concatenate([verdict.turns(directions), verdict.turns(unturned)], axis=1)[3:]
         told = null_space(np.column_stack([anywhere, ahead]).T)
         if not told.size:
             axes.append(told)
             continue
-        variance, vectors = np.linalg.eigh(told.T @ turned.cov[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] @ told)
+        variance, vectors = np.linalg.eigh(told.T @ (turned.cov[own, own] + lean[own, own]) @ told)
         each = told @ vectors
         axes.append(each[:, (each.T @ apart) ** 2 > SURE**2 * variance])
     return axes
@@ -53,12 +66,14 @@ def between(found: Moving, axes: Sequence[Array]) -> tuple[Array, Array]:
     """
     T, by_found = found.T_base_sensor.copy(), np.eye(len(found.free))
     n = len(T)
-    for k, bias in enumerate(found.bias[1:]):
-        if axes[k].size:
+    for k, about in enumerate(axes):
+        if about.size:
+            bias = about @ about.T @ found.bias[k + 1]
             way = -bias if np.linalg.norm(bias) > MOST else -bias / 2
             turn, by = slice(6 * k + 3, 6 * k + 6), 6 * (n - 1) + 3 * k
             by_found[turn, turn] = se3.exp_so3(way)
-            by_found[turn, by : by + 3] = -np.linalg.norm(way) / np.linalg.norm(bias) * se3.left_jacobian(way)
+            share = np.linalg.norm(way) / np.linalg.norm(bias)
+            by_found[turn, by : by + 3] = -share * se3.left_jacobian(way) @ about @ about.T
             T[k + 1, :3, :3] = by_found[turn, turn] @ T[k + 1, :3, :3]
     return T, by_found
 
@@ -70,8 +85,9 @@ def doubt(turned: Turning, found: Moving, axes: Sequence[Array], ahead: Array) -
     fault is shared by all sensors, so theirs count as one: what they differ by between each other stays known.
     """
     own, other = np.zeros((len(found.free), 4)), np.zeros((len(found.free), 3))
-    for k, (about, bias) in enumerate(zip(axes, found.bias[1:], strict=True)):
+    for k, about in enumerate(axes):
         if about.size:
+            bias = about @ about.T @ found.bias[k + 1]
             turn, size = slice(6 * k + 3, 6 * k + 6), np.linalg.norm(bias)
             if size > MOST:
                 own[turn, :3] = USUAL * about @ about.T

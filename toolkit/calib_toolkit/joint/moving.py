@@ -22,8 +22,8 @@ from calib_toolkit.joint.windows import Index, Windows, coning, splines
 from calib_toolkit.types import Motions
 
 Array = NDArray[np.float64]
-Prior = Callable[[Array], tuple[Array, Array]]
-"""Of poses (n, 4, 4): the information (6(n-1), 6(n-1)) of measured numbers and its gradient (6(n-1),)."""
+Prior = Callable[[Array, Array], tuple[Array, Array]]
+"""Of poses (n, 4, 4) and biases (n, 3): the information (9(n-1), 9(n-1)) of what was known and its gradient."""
 
 STENCIL = np.array([-1.0, 3.0, -3.0, 1.0])
 LOOSE = 100.0
@@ -36,8 +36,6 @@ NOTHING, ANY = 1e6, 2.0
 """Variance given to a direction that does not count, and that from which one does not: it may be any."""
 AROUND = 1.0
 """Seconds over which that travel is told: a single reading would choose itself by its noise."""
-BIASED = 0.05
-"""Radians by which a sensor's travel may be turned against its turns, if it is at all."""
 FAR = 30.0
 """Metres or radians: what the drive tells nothing of is no further from where it started."""
 ROUNDS = 30
@@ -171,12 +169,11 @@ class _Search:
             r = s.reading
             arrow.add(s.windows, r.by_twist, s.weight, r.residual)
             arrow.add_parameters(s.columns, s.by_parameter, s.windows, r.by_twist, s.weight, r.residual)
-        information, pull = self.prior(self.T)
-        poses, biases = slice(len(pull)), slice(len(pull), len(self.free))
-        arrow.information[poses, poses] += information + np.eye(len(pull)) / FAR**2
-        arrow.gradient[poses] += pull
-        arrow.information[biases, biases] += np.eye(len(self.free) - len(pull)) / BIASED**2
-        arrow.gradient[biases] -= self.bias[1:].ravel() / BIASED**2
+        information, pull = self.prior(self.T, self.bias)
+        known, poses = np.arange(len(pull)), np.arange(6 * (len(self.T) - 1))
+        arrow.information[np.ix_(known, known)] += information
+        arrow.information[poses, poses] += 1 / FAR**2
+        arrow.gradient[known] += pull
         arrow.add_prior(STENCIL, self.twists, np.diag(self.hold))
         arrow.hold(0, 1e6)
         return arrow

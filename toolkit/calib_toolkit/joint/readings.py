@@ -51,7 +51,7 @@ def joined(m: Motions, together: int) -> Motions:
     for k in range(1, together):
         more = np.flatnonzero(begins + k < ends)
         vec[more], cov[more] = _then(vec[more], cov[more], m.vec[begins[more] + k], m.cov[begins[more] + k])
-    return Motions(m.start[begins], m.end[ends - 1], vec, cov, m.has_scale)
+    return replace(m, start=m.start[begins], end=m.end[ends - 1], vec=vec, cov=cov)
 
 
 def travel(m: Motions) -> Motions:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from calib_toolkit import observability, sync
 from calib_toolkit.joint import spread, start, turning
@@ -53,7 +54,18 @@ def estimate(motions: Sequence[Motions], turned: Turning, known: Sequence[Late])
         # a speed changes so slowly that noise may be most of what changed
         wider = np.tile(1 / np.clip(1 - went.feigned, spread.LEAST, 1.0), 2)
         cov = cov + _only(went.clock_cov * np.outer(wider, wider), more)
-    return Told(replace(clocks, dt=dt, skew=skew), cov, ~told)
+    own = told.copy()
+    own[[k.clock for k in known]] = False
+    return Told(replace(clocks, dt=dt, skew=skew), cov + _only(_late(motions, clocks.of), own), ~told)
+
+
+def _late(motions: Sequence[Motions], of: NDArray[np.int64]) -> Array:
+    """(2(q-1), 2(q-1)) of offsets and skews: what the sensors' motions are late by and the base's, which all share.
+
+    of: (n,) clocks. Of several on one clock the best counts.
+    """
+    late = np.array([min(m.late for m, c in zip(motions, of, strict=True) if c == k) for k in range(of.max() + 1)])
+    return block_diag(np.diag(late[1:] ** 2) + late[0] ** 2, np.zeros((len(late) - 1, len(late) - 1)))
 
 
 def _by_speed(travels: Sequence[Motions], clocks: Clocks, told: Mask) -> Turning:
