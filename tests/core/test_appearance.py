@@ -131,7 +131,7 @@ def test_sigmas_hold():
     noise = 5 * SIGMA
     values = []
     for seed in range(40):
-        found = search.estimate(Bowl(noise=noise, seed=seed), pair_at(TRUE, sigma=10 * SIGMA), None, seed)
+        found = search.estimate(Bowl(noise=noise, seed=seed), pair_at(TRUE, sigma=4 * SIGMA), None, seed)
         cov = found.transform.cov - own
         values.append(error_of(found) @ np.linalg.solve(cov, error_of(found)))
     # Hotelling's: 25 moments know their own spread badly
@@ -145,6 +145,16 @@ def test_a_direction_without_curvature_is_said_to_be_unknown():
     sigma = np.sqrt(np.diag(found.transform.cov))
     assert sigma[2] > 1.0
     assert np.all(sigma[[0, 1]] < 0.03)
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_what_the_motion_leaves_open_appearance_must_tell(seen):
+    """Or else the answer is wherever the search was."""
+    shape, wide = 1 / SIGMA, np.where(np.arange(6) == 2, 10.0, SIGMA)
+    shape[2] *= seen
+    found = search.estimate(Bowl(shape=shape), pair_at(TRUE, sigma=wide), None)
+    assert found.converged == seen
+    assert ("leaves the pose open" in found.note) != seen
 
 
 def test_a_pose_far_from_the_motion_is_refused():

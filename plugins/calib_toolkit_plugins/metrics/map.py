@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from calib_toolkit import NoOptions, Pair, PairEstimate, Transform, hookimpl, se3
 from calib_toolkit_plugins.metrics.map_links import Problem, problem_of
 from calib_toolkit_plugins.metrics.map_scans import Patch, Sweep, covered, misfit, read_sweep, straighten
-from calib_toolkit_plugins.metrics.map_solve import LATE, Equations, State, equations, freed, moved, stepped
+from calib_toolkit_plugins.metrics.map_solve import LATE, Equations, State, equations, freed, moved, steadied, stepped
 
 Array = NDArray[np.float64]
 
@@ -36,6 +36,8 @@ UNSEEN, FAR = 10.0, 10.0
 """Sigma of what is not seen, metres; a rotation counts as what it moves at the distance ``FAR``."""
 MATCHING = np.repeat([1e-3, np.radians(0.01)], 3)
 """Sigma of what matching errs in all scans alike (metres, radians): no number of runs averages it away."""
+TOGETHER = 8.0
+"""Seconds within which runs have errors in common: scans, or the path between them."""
 SHARED = 0.1
 """Share of the points of one lidar that must find surfaces of the other."""
 
@@ -47,7 +49,7 @@ class Map:
 
     id = "map"
     options: type = NoOptions
-    version = "2"
+    version = "3"
 
     def accepts(self, kind_a: str, kind_b: str) -> bool:
         """Whether one is a lidar, and the other a lidar or a sensor of poses."""
@@ -166,7 +168,7 @@ def _step(T_from: Array, T_to: Array) -> Array:
 def _without_prior(problem: Problem, state: State, found: Equations) -> tuple[Array, Array]:
     """``T_path_lidar`` and its covariance from the residuals alone: a last step, without the prior, along what is
     seen."""
-    found = freed(found, state.T) if problem.links.one_mount else found
+    found = freed(found, state.T) if problem.links.one_mount else steadied(found)
     seen, kept, unseen = _directions(found)
     T = stepped(state.T, -seen / kept @ seen.T @ found.gradient)
     turned = np.vstack([-se3.skew(T[:3, 3]), np.eye(3)])
@@ -190,14 +192,18 @@ def _jackknife(found: Equations, seen: Array, kept: Array) -> Array:
     """Covariance (6, 6) from how far the estimate moves when one run of scans is left out (Efron, 1982).
 
     A single turn may tell nearly all of a lever arm; the plain spread of the gradients then promises too much.
-    Along no direction is it taken to be less than if every link erred on its own, which so few runs may feign.
+    Runs that are near in time err alike (Bartlett's weights; Newey & West, 1987). Along no direction is it taken to
+    be less than if every link erred on its own, which so few runs may feign.
     """
     without = np.diag(kept) - seen.T @ found.shares @ seen
     slopes = found.slopes - found.slopes.mean(axis=0)
     left, axes = np.linalg.eigh(without)
     inverse = axes / np.maximum(left, LEFT)[:, None] @ np.swapaxes(axes, 1, 2)
     moves = np.einsum("nij,nj->ni", inverse, slopes @ seen) * np.sqrt(kept)
-    variance, axes = np.linalg.eigh((1 - 1 / len(moves)) * moves.T @ moves)
+    alike = np.maximum(1 - np.abs(found.when[:, None] - found.when) / TOGETHER, 0.0)
+    # the mean was taken out, which hides a part of what all have in common
+    hidden = 1 - alike.sum() / len(moves) ** 2
+    variance, axes = np.linalg.eigh(moves.T @ alike @ moves / max(hidden, LEFT))
     axes = seen / np.sqrt(kept) @ axes
     return np.asarray(axes * np.maximum(variance, 1.0) @ axes.T)
 

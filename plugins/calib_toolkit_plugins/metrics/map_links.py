@@ -115,7 +115,7 @@ def _links(
     first, second = (t.stream.stamps[k] + t.dt for t, k in zip((targets, sources), readings.T, strict=True))
     T, T_late = (_between(motion, first + h * by_dt[0], second + h * by_dt[1]) for h in (0.0, LATE))
     span = np.maximum(np.abs(second - first), sources.stream.period)
-    return Links(T, T_late, span, group, targets == sources)
+    return Links(T, T_late, second, span, group, targets == sources)
 
 
 def _between(motion: Motions, first: Array, second: Array) -> Array:

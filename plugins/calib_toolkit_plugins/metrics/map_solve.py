@@ -31,12 +31,14 @@ class Links:
     """Pairs of scans.
 
     T_path: (n, 4, 4) the path's own motion between the two. T_late: the same if the clock offset were ``LATE`` more.
-    span: (n,) seconds between them. group: (n,) which run of scans they are of. one_mount: both
-    scans are of the lidar that is looked for; otherwise only the second is, and the first made the path.
+    when: (n,) stamps of the second. span: (n,) seconds between them. group: (n,) which run of scans they are of.
+    one_mount: both scans are of the lidar that is looked for; otherwise only the second is, and the first made the
+    path.
     """
 
     T_path: Array
     T_late: Array
+    when: Array
     span: Array
     group: NDArray[np.int64]
     one_mount: bool
@@ -45,7 +47,8 @@ class Links:
         return len(self.span)
 
     def __getitem__(self, part: NDArray[np.bool_]) -> "Links":
-        return Links(self.T_path[part], self.T_late[part], self.span[part], self.group[part], self.one_mount)
+        columns = (self.T_path, self.T_late, self.when, self.span, self.group)
+        return Links(*(c[part] for c in columns), self.one_mount)
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,8 @@ class Equations:
 
     shares, slopes: (k, 6, 6) and (k, 6), what each adds. feigned: (6, 6) the part of the information that the path's
     errors alone would show. error, spread: (n, 6) and (n, 6, 6) of each link's step given no step of the mount.
-    coupling: (n, 6, 6) its change with one.
+    coupling: (n, 6, 6) its change with one. when: (k,) seconds of each run. drift: what each adds of an error that
+    the path gathers every second alike.
     """
 
     shares: Array
@@ -83,6 +87,8 @@ class Equations:
     error: Array
     spread: Array
     coupling: Array
+    when: Array
+    drift: "Drift"
 
     @property
     def information(self) -> Array:
@@ -93,6 +99,18 @@ class Equations:
     def gradient(self) -> Array:
         """(6,)."""
         return np.asarray(self.slopes.sum(axis=0))
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Of an error (6,) that a path gathers each second, by run: shares (k, 6, 6) and slopes (k, 6) as of the mount's;
+    with_mount: (k, 6, 6) what both have in common. variance: (6,) that it may have.
+    """
+
+    shares: Array
+    slopes: Array
+    with_mount: Array
+    variance: Array
 
 
 def equations(state: State, links: Links, information: Array, gradient: Array) -> Equations:
@@ -117,6 +135,8 @@ def equations(state: State, links: Links, information: Array, gradient: Array) -
         -_of(spread, own),
         spread,
         -spread @ np.swapaxes(cross, 1, 2),
+        _per_run(run, links.when) / np.bincount(run),
+        _drift(state, links, run, P, spread, own, cross),
     )
 
 
@@ -158,6 +178,33 @@ def freed(found: Equations, T: Array) -> Equations:
         error: Array = -_of(inner @ turned.T, found.slopes + found.shares @ step)
         variance = np.maximum(np.mean(error**2 + np.diagonal(inner, axis1=1, axis2=2), axis=0), FLOOR[3:] ** 2)
     return replace(found, shares=shares, slopes=slopes)
+
+
+def steadied(found: Equations) -> Equations:
+    """The equations when the path has an error that it gathers steadily, which is eliminated.
+
+    A lidar's own path leans a little, always to the same side. Where one lidar sees what the other saw earlier, and
+    never the other way round, that looks like an error of the mount. It may be as large as its errors at random are
+    over a second.
+    """
+    drift = found.drift
+    gain = drift.with_mount.sum(axis=0) @ np.linalg.inv(drift.shares.sum(axis=0) + np.diag(1 / drift.variance))
+    both = gain @ np.swapaxes(drift.with_mount, 1, 2)
+    prior = np.diag(1 / drift.variance) / len(drift.shares)
+    shares = found.shares - both - np.swapaxes(both, 1, 2) + gain @ (drift.shares + prior) @ gain.T
+    return replace(found, shares=shares, slopes=found.slopes - drift.slopes @ gain.T)
+
+
+def _drift(
+    state: State, links: Links, run: NDArray[np.int64], P: Array, spread: Array, own: Array, cross: Array
+) -> Drift:
+    by_error = links.span[:, None, None] * P
+    return Drift(
+        _per_run(run, by_error @ (links.span[:, None, None] * np.eye(6) - spread @ by_error)),
+        _per_run(run, _of(by_error, _of(spread, own) - state.error)),
+        _per_run(run, cross @ spread @ by_error),
+        state.variance,
+    )
 
 
 def _of(A: NDArray[Any], v: NDArray[Any]) -> Array:

@@ -23,6 +23,8 @@ LEAST = np.array([0.05] * 3 + [np.radians(0.5)] * 3)
 """Metres, radians: a search is never narrower than this, for a stated sigma may be too small."""
 MOST = np.array([0.5] * 3 + [np.radians(5.0)] * 3)
 """One sigma is never taken to be more: half of the range that is searched."""
+TOLD = 0.5
+"""Share of these within which appearance must tell by itself what the motion leaves open."""
 FAR = 4.0
 """Length of ``z`` beyond which the best pose is not believed."""
 BLURS = (2.0, 1.0, 0.5)
@@ -86,6 +88,10 @@ def estimate(
         return _refused(metric, pair, "no pose fits better than others that the motion allows")
     statistics = {"moments": float(found.moments), "clear": found.clear, "cost": found.cost, "apart": found.apart}
     cov = frame.L @ found.cov @ frame.L.T + np.diag(OWN**2)
+    if _open(pair.prior, cov):
+        return _refused(
+            metric, pair, "the motion leaves the pose open, and the best one is no sharper than what was searched"
+        )
     transform = Transform(pair.a.name, pair.b.name, frame.poses(found.z)[0], cov)
     return PairEstimate(metric.id, transform, _by_clock(pair), statistics=statistics)
 
@@ -117,6 +123,17 @@ def whitened(prior: Transform) -> Frame:
     wide = (axes * np.minimum(values, 1.0)) @ axes.T * np.outer(MOST, MOST)
     cov = wide + np.diag(LEAST**2)
     return Frame(replace(prior, cov=cov), np.linalg.cholesky(cov))
+
+
+def _open(prior: Transform, cov: Array) -> bool:
+    """Whether along something that the motion does not tell appearance, with cov (6, 6), does not either.
+
+    There the answer lies where the search happened to be, or beyond: nothing holds a parabola that is nearly flat.
+    """
+    values, axes = np.linalg.eigh(prior.cov / np.outer(MOST, MOST))
+    untold = axes[:, values > FAR]  # wider than all that is searched
+    found = untold.T @ (cov / np.outer(MOST, MOST)) @ untold
+    return bool(np.linalg.eigvalsh(found).max(initial=0.0) > TOLD**2)
 
 
 def _searched(metric: CostMetric, moments: Sequence[Any], frame: Frame, seed: int) -> Evidence | None:
