@@ -47,8 +47,8 @@ class Links:
         return len(self.span)
 
     def __getitem__(self, part: NDArray[np.bool_]) -> "Links":
-        columns = (self.T_path, self.T_late, self.when, self.span, self.group)
-        return Links(*(c[part] for c in columns), self.one_mount)
+        T_path, T_late, when, span = (c[part] for c in (self.T_path, self.T_late, self.when, self.span))
+        return Links(T_path, T_late, when, span, self.group[part], self.one_mount)
 
 
 @dataclass(frozen=True)
