@@ -159,6 +159,7 @@ def _place(timed: Timed, known: Sequence[Measured]) -> Placed:
     # a clock that is off by some time moves the poses with it
     poses, clock_cov = 6 * (len(names) - 1), timed.told.cov
     cov, moved = (by_found @ cov @ by_found.T)[:poses, :poses], (-by_found @ gain @ found.by_clock)[:poses]
+    cov = cov + leaning.late(timed.motions, ahead / float(np.sum(np.diff(timed.steps.ends, axis=1))))
     joint = np.block([[cov + moved @ clock_cov @ moved.T, moved @ clock_cov], [clock_cov @ moved.T, clock_cov]])
     return Placed(T, joint, _unknown(timed, open_, joint), found)
 

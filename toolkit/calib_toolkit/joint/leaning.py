@@ -1,4 +1,4 @@
-"""Sensors whose travel is turned against their own turns: which of the two to believe, and how far."""
+"""Sensors whose travel is turned against their own turns, or late: which of the two to believe, and how far."""
 
 from collections.abc import Sequence
 
@@ -30,6 +30,18 @@ def stated(motions: Sequence[Motions], R: Array) -> Array:
     By what the sensors state of it: the base's own fault is shared by all. R: (n, 3, 3) of the poses.
     """
     base, *others = (axes * m.lean**2 @ axes.T for m, axes in zip(motions, R, strict=True))
+    return np.asarray(block_diag(*others) + np.tile(base, (len(others), len(others))))
+
+
+def late(motions: Sequence[Motions], velocity: Array) -> Array:
+    """(6(n-1), 6(n-1)) of poses: travel may be late by as much as turns are, but not by the same.
+
+    In a bend it then points aside by what the vehicle turned meanwhile, just as if the sensor sat further back. The
+    base's own fault is shared by all. velocity: (3,) of the base on average, metres a second, its axes.
+    """
+    along = np.zeros((6, 6))
+    along[:3, :3] = np.outer(velocity, velocity)
+    base, *others = (m.late**2 * along for m in motions)
     return np.asarray(block_diag(*others) + np.tile(base, (len(others), len(others))))
 
 
