@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 LEAN = float(np.radians(0.02))
 """By which a lidar's own calibration, and surfaces seen at a slant, turn its travel."""
-LATE = 0.006
+LATE = 0.01
 """Of a sweep, by which motion seems late: what is seen ahead is not seen when what is seen behind is, so that the
 instant at which a sweep shows roll and pitch depends on where there is something to see."""
 COARSER = 2.0
@@ -51,7 +51,7 @@ class VelodyneOptions:
 @hookimpl
 def calib_register_sensors() -> list[Sensor]:
     """The ``velodyne`` sensor."""
-    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="4")]
+    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="5")]
 
 
 def estimate(stream: Stream, options: VelodyneOptions) -> Motions:

@@ -222,7 +222,7 @@ def _look(comparison: Comparison, calibration: Calibration, config: Config) -> L
         look = replace(look, note=found.note)
         return _stepped(look, metric, moments, pair.prior) if isinstance(metric, CostMetric) else look
     except CalibrationError as e:
-        return replace(look, note=f"{comparison.name}: {e}")
+        return replace(look, note=str(e))
 
 
 def _held_out(pair: Pair, config: Config) -> tuple[Pair, bool]:

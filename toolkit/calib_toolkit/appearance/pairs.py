@@ -32,11 +32,6 @@ class Comparison:
     metric: Metric | CostMetric
     pair: Pair
 
-    @property
-    def name(self) -> str:
-        """For people."""
-        return f"{self.metric.id} of {self.pair.a.name} and {self.pair.b.name}"
-
 
 def comparisons(
     log: Log,

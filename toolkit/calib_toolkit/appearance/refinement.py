@@ -147,7 +147,7 @@ def _estimate(comparison: Comparison, chosen: Any, seed: int, folder: Path | Non
     try:
         found = estimate(metric, pair, chosen, seed)
     except CalibrationError as e:
-        return PairEstimate(metric.id, pair.prior, converged=False, note=f"{comparison.name}: {e}")
+        return PairEstimate(metric.id, pair.prior, converged=False, note=str(e))
     if folder is not None:
         cache.store_pair(folder, key, found)
     return found

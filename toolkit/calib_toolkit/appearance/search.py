@@ -228,5 +228,4 @@ def _by_clock(pair: Pair) -> Array:
 
 def _refused(metric: CostMetric, pair: Pair, why: str) -> PairEstimate:
     """No estimate, and why."""
-    note = f"{metric.id} of {pair.a.name} and {pair.b.name}: {why}"
-    return PairEstimate(metric.id, pair.prior, converged=False, note=note)
+    return PairEstimate(metric.id, pair.prior, converged=False, note=why)

@@ -208,7 +208,7 @@ def _sentences(j: "Judgement") -> Iterator[str]:
 
     who, lead = f"{j.b} in {j.a}", j.lead
     if lead is None:
-        yield f"{who}: can not be judged: {'; '.join(look.note for look in j.looks)}"
+        yield f"{who}: can not be judged: {'; '.join(f'{look.metric}: {look.note}' for look in j.looks)}"
         return
     wanted, told, disputed = (np.flatnonzero(axes).tolist() for axes in (j.better, j.told, j.disputed))
     if told:
@@ -228,7 +228,7 @@ def _sentences(j: "Judgement") -> Iterator[str]:
     if not j.shown.all():
         axes = ", ".join(_axis(j, k) for k in range(6) if not j.shown[k])
         yield f"{who}: not shown, and so not judged: {axes}"
-    yield from (look.note for look in j.looks if not look.found)
+    yield from (f"{who}, {look.metric}: {look.note}" for look in j.looks if not look.found)
     if not lead.held_out:
         yield f"{who}: the drive is too short for moments that a run would not look at; these are all it has"
 

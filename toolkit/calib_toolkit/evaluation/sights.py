@@ -133,7 +133,7 @@ def _by_metric(c: Comparison, start: Calibration, label: str, truth: Calibration
     T = search.unconstrained(metric, c.pair, given, config.seed)
     way = f"{metric.id}{UNCONSTRAINED}"
     if T is None:
-        return [*findings, Finding(way, label, refused=f"{c.name}: in too few moments do both see the same")]
+        return [*findings, Finding(way, label, refused="in too few moments do both see the same")]
     free = _placed(way, label, _with(start, T, np.zeros((6, 6))), truth)
     return [*findings, replace(free, sigma={})]
 
