@@ -163,9 +163,17 @@ def test_nerf_as_rays_are_cast_through_it(exporting):
         point = [*(T[:3, 3] + 7.0 * ray), 1.0]
         seen = lens.K @ (rig.between(name, "velo").T_a_b @ point)[:3]
         assert np.allclose(seen, 7.0 * np.array([u, v, 1.0]))
+        assert "k3" not in frame
     (velo, ins) = content["other_sensors"]
     assert np.allclose(ins["T_base_sensor"], rig.between("velo", "ins").T_a_b, **WITHIN)
     assert np.array_equal(velo["T_base_sensor"], np.eye(4))
+
+
+def test_a_nerf_says_who_does_not_read_its_last_coefficient(exporting):
+    lens = CameraIntrinsics(np.diag([700.0, 700, 1]), np.array([0.1, 0.2, 0.01, 0.02, 0.3]))
+    content = json.loads(exporting.write(ordinary("nerf"), "nerf", intrinsics={"cam1": lens}).read_text())
+    assert [content["frames"][1][k] for k in ("k1", "k2", "p1", "p2", "k3")] == [0.1, 0.2, 0.01, 0.02, 0.3]
+    assert "instant-ngp does not read k3" in content["comment"]
 
 
 def test_a_nerf_of_another_program(exporting, tmp_path):

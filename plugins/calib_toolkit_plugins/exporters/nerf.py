@@ -11,8 +11,8 @@ from calib_toolkit import Calibration, CameraIntrinsics, Exporter, hookimpl
 from calib_toolkit.errors import DataError
 from calib_toolkit_plugins.exporters import clocks, files, poses
 
-OPENCV = ("k1", "k2", "p1", "p2")
-"""Coefficients of the camera model OPENCV, in OpenCV's order; k3 is none of them."""
+OPENCV = ("k1", "k2", "p1", "p2", "k3")
+"""Coefficients of distortion in OpenCV's order; nerfstudio takes all, instant-ngp all but k3."""
 CENTRE = 0.5
 """The format's centre of the first pixel, which is COLMAP's; OpenCV's is 0."""
 T_OPTICAL_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -48,19 +48,22 @@ def write(c: Calibration, path: Path, intrinsics: Mapping[str, CameraIntrinsics]
         f"world, which is the frame of {c.base}; with y down and z ahead, {poses.direction(c, c.base, other)}. "
         f"other_sensors have their own axes. {clocks.sentence(path)}"
     )
+    frames: list[dict[str, Any]] = [
+        {
+            "file_path": f"{n}.png",
+            "sensor": n,
+            "transform_matrix": (T_base[n] @ T_OPTICAL_OPENGL).tolist(),
+            **_camera(n, intrinsics.get(n)),
+        }
+        for n in seen
+    ]
+    if any("k3" in frame for frame in frames):
+        said += " instant-ngp does not read k3: give it undistorted images."
     content = {
         "comment": said,
         "base": c.base,
         "camera_model": "OPENCV",
-        "frames": [
-            {
-                "file_path": f"{n}.png",
-                "sensor": n,
-                "transform_matrix": (T_base[n] @ T_OPTICAL_OPENGL).tolist(),
-                **_camera(n, intrinsics.get(n)),
-            }
-            for n in seen
-        ],
+        "frames": frames,
         "other_sensors": [{"sensor": n, "T_base_sensor": T_base[n].tolist()} for n in c.names if n not in seen],
     }
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
@@ -99,7 +102,7 @@ def _camera(name: str, camera: CameraIntrinsics | None) -> dict[str, Any]:
     K, distortion = camera.K, camera.distortion
     if np.any(distortion[len(OPENCV) :]) or K[0, 1] != 0:
         raise DataError(f"{name} has a distortion beyond {' '.join(OPENCV)}, or a skew; leave --intrinsics out")
-    given = dict.fromkeys(OPENCV, 0.0) | dict(zip(OPENCV, distortion.tolist(), strict=False))
+    given = dict.fromkeys(OPENCV[:4], 0.0) | dict(zip(OPENCV, np.trim_zeros(distortion, "b").tolist(), strict=False))
     return {
         "fl_x": float(K[0, 0]),
         "fl_y": float(K[1, 1]),
