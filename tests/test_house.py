@@ -121,6 +121,13 @@ def test_help_does_not_wait_for_numpy():
     assert not {"numpy", "scipy", "rich", *HEAVY} & packages_loaded_by("import calib_toolkit.cli")
 
 
+def test_tables_do_not_wait_for_estimators():
+    code = "import sys, calib_toolkit.cli.tables; print('scipy.stats' in sys.modules, 'calib_toolkit.joint' in sys.modules)"
+    assert (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.split() == ["False"] * 2
+    )
+
+
 def test_the_registry_does_not_wait_for_heavy_libraries():
     assert not HEAVY & packages_loaded_by("from calib_toolkit.plugins import registry; registry()")
 
