@@ -50,6 +50,8 @@ def open_log(path: Path, context: ReadContext) -> Log:
     Raises DataError if there is none; a sensor that can not be read is left out, and a note says why.
     """
     home = _home(path.absolute())
+    if not home.is_dir():
+        raise DataError(f"{home} is no folder; name {HOME}, or the folder that holds it")
     logs, notes = [], []
     frames: dict[str, Array] = {}
     for folder in sorted(p for p in home.iterdir() if isfile(p / TABLE)):

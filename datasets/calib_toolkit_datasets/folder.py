@@ -50,6 +50,8 @@ def matches(path: Path) -> bool:
 def open_log(path: Path, context: ReadContext) -> Log:
     """Every sensor that can be read; what can not is left out with a note. Raises DataError if there is none."""
     path = path.absolute()
+    if not path.is_dir():
+        raise DataError(f"{path} is no folder; name one with a subfolder or a file for each sensor")
     notes: list[str] = []
     logs: list[Log] = []
     for entry in sorted(path.iterdir()):

@@ -280,9 +280,11 @@ def test_every_hook_has_a_test_and_a_heading() -> None:
 
 
 def test_the_command_lists_plugins_and_where_they_come_from(tmp_path: Path) -> None:
-    file = one_file(tmp_path, SENSOR.replace("ID", "sonar"))
+    far = tmp_path / ("a_folder_with_a_long_name_" * 5)
+    far.mkdir()
+    file = one_file(far, SENSOR.replace("ID", "sonar"))
     command = [Path(sys.executable).with_name("calib-toolkit"), "plugins", "--plugin", file]
-    environment = {"PATH": "/usr/bin:/bin", "COLUMNS": "400", "LC_ALL": "C.UTF-8"}
+    environment = {"PATH": "/usr/bin:/bin", "LC_ALL": "C.UTF-8"}  # no terminal, so nothing is broken over lines
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 0, done.stderr
     lines = [set(line.split()) for line in done.stdout.splitlines()]

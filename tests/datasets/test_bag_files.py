@@ -120,6 +120,22 @@ def test_topics_are_listed_with_what_keeps_them(tmp_path):
         log.select(["velo", "odd=/none/points"])
 
 
+def test_a_bag_without_sensors_says_what_it_has_and_what_is_read(tmp_path):
+    m = Messages("cdr")
+    rows = [("/tf", START + k * STEP, m.frames(m.transform("map", "base", (k, 0, 0)))) for k in range(3)]
+    with pytest.raises(DataError, match=r"/tf \(tf2_msgs/TFMessage\): it tells where frames sit") as refused:
+        open_log(write(tmp_path / "tf", "sqlite", rows))
+    assert "sensor_msgs/PointCloud2" in str(refused.value)
+    rows += [(f"/status{k:02d}", START, m.make("std_msgs/String", "on")) for k in range(30)]
+    rows += [("/cam0/camera_info", START, m.info(START, np.eye(3)))]
+    with pytest.raises(
+        DataError, match=r"/cam0/camera_info \(sensor_msgs/CameraInfo\): no images go with it"
+    ) as refused:
+        open_log(write(tmp_path / "more", "sqlite", rows))
+    assert "/status00 (std_msgs/String): no sensor reads this type" in str(refused.value)
+    assert "and 12 topics more" in str(refused.value)
+
+
 def test_some_stamps_of_zero_and_some_that_go_back(tmp_path):
     m, rng = Messages("cdr"), np.random.default_rng(0)
     stamps = [START + k * STEP for k in range(10)]

@@ -9,14 +9,14 @@ from calib_toolkit import Calibration, se3
 from calib_toolkit.exporting import export
 from calib_toolkit.plugins import Registry
 
-FORMATS = ("autoware", "colmap", "csv", "kalibr", "kitti", "nuscenes", "ros2", "urdf", "yaml")
-ENDING = {"csv": ".csv", "urdf": ".urdf", "colmap": ".json", "nuscenes": ".json", "kitti": ""}
+FORMATS = ("autoware", "colmap", "csv", "kalibr", "kitti", "nerf", "nuscenes", "ros2", "urdf", "yaml")
+ENDING = {"csv": ".csv", "urdf": ".urdf", "colmap": ".json", "nerf": ".json", "nuscenes": ".json", "kitti": ""}
 SENSORS = {
     **dict.fromkeys(FORMATS, ("velo", "ins", "cam0", "cam1")),
     "colmap": ("cam0", "cam1", "cam2"),
     "kalibr": ("ins", "cam0", "cam1", "cam2"),
     **dict.fromkeys(
-        ("autoware", "csv", "kitti", "nuscenes", "ros2", "urdf", "yaml"), ("velo", "ins", "cam0", "cam1")
+        ("autoware", "csv", "kitti", "nerf", "nuscenes", "ros2", "urdf", "yaml"), ("velo", "ins", "cam0", "cam1")
     ),
 }
 """A rig that each format can hold, the base first."""

@@ -30,6 +30,16 @@ def rig_json(**changed):
     return json.dumps([{"cameras": [{"image_prefix": "a/", "ref_sensor": True}, {**camera, **changed}]}])
 
 
+FRAME = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
+
+
+def frames(T=None, **changed):
+    """transforms.json of one frame, keys of it or beside it changed."""
+    frame = FRAME if T is None else {**FRAME, "transform_matrix": T.tolist()}
+    frame = {**frame, **{k: v for k, v in changed.items() if k in FRAME}}
+    return json.dumps({"frames": [frame], **{k: v for k, v in changed.items() if k not in FRAME}})
+
+
 BAD = {
     "no matrix": ("kalibr", CAM0 % "[1, 2, 3]", "T_cam_imu of cam0 is no list of four rows"),
     "short row": ("kalibr", CAM0 % "[[1, 0], [0], [], []]", "a list of 4 numbers belongs"),
@@ -76,13 +86,22 @@ BAD = {
     "two references": ("colmap", f'[{{"cameras": [{REFERENCE}, {REFERENCE}]}}]' % ("a", "b"), "2 reference cameras"),
     "short quaternion": ("colmap", rig_json(cam_from_rig_rotation=[1, 0, 0]), "a list of 4 numbers"),
     "twice": ("colmap", rig_json(image_prefix="a/"), "camera a twice"),
+    "no frames": ("nerf", '{"frames": 3}', "frames is not a list of tables"),
+    "no list of numbers": ("nerf", frames(transform_matrix=[[1]]), "transform_matrix of a is no list of four rows"),
+    "mirrored": ("nerf", frames(np.diag([-1.0, 1, 1, 1])), "left-handed"),
+    "enlarged": ("nerf", frames(np.diag([2.0, 2, 2, 1])), "transform_matrix of a is not a rotation"),
+    "no metres": ("nerf", frames(applied_scale=0.1), "its lengths are not metres"),
+    "one image twice": ("nerf", frames(frames=[FRAME, FRAME]), "the sensor a twice"),
+    "no image": ("nerf", frames(file_path=7), "the sensor of a frame is 7"),
+    "no such base": ("nerf", frames(base="b"), "its base b is not there"),
+    "a base away": ("nerf", frames(base="a"), "its base a is not there, or not at the origin"),
     "one table": ("nuscenes", "[]", "names them, is missing"),
     "other titles": ("csv", "sensor,base,x,y,z\nvelo,velo,0,0,0\n", "must have the titles"),
     "open quote": ("csv", '"a\n', "no table of comma-separated values"),
     "empty": ("csv", "", "no table of comma-separated values"),
     "no base": ("yaml", "sensors: {}\n", "has no base"),
 }  # fmt: skip
-ENDINGS = {"urdf": "rig.urdf", "colmap": "rig.json", "nuscenes": "rig.json", "csv": "rig.csv"}
+ENDINGS = {"urdf": "rig.urdf", "colmap": "rig.json", "nerf": "rig.json", "nuscenes": "rig.json", "csv": "rig.csv"}
 
 
 @pytest.mark.parametrize(("format_id", "content", "sentence"), BAD.values(), ids=BAD)
@@ -97,7 +116,9 @@ def test_bad_files_are_refused_in_one_sentence(exporting, format_id, content, se
     assert not trap.exists()
 
 
-@pytest.mark.parametrize("format_id", [f for f in FORMATS if f not in ("kitti", "urdf", "colmap", "nuscenes")])
+@pytest.mark.parametrize(
+    "format_id", [f for f in FORMATS if f not in ("kitti", "urdf", "colmap", "nerf", "nuscenes")]
+)
 def test_a_file_that_was_cut_short_is_refused(exporting, format_id):
     path = exporting.write(ordinary(format_id), format_id)
     text = path.read_text()

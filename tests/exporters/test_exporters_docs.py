@@ -67,6 +67,12 @@ def test_poses_the_other_way_map_the_point_to_the_camera():
     assert np.allclose(np.reshape(said["R"], (3, 3)) @ POINT_VELO + said["T"], POINT_CAM0)
 
 
+def test_the_camera_of_a_nerf_looks_along_minus_z():
+    T = np.reshape(row("nerf")["transform_matrix"], (4, 4))
+    assert np.allclose(T @ [0, 0, -4, 1], [*POINT_VELO, 1])
+    assert "maps (0, 0, -4), where y is up and z backward, to (4.5, 0.1, -0.2)" in PAGE
+
+
 def test_the_body_of_the_camera_in_autoware_looks_along_x():
     said = row("autoware")
     R = Rotation.from_euler("xyz", [said[k][0] for k in ("roll", "pitch", "yaw")])

@@ -147,6 +147,50 @@ def test_colmap_as_its_documentation_has_it(exporting):
     assert others[0]["camera_params"] == [700.0, 710.0, 320.0, 240.0, 0.1, 0.2, 0.01, 0.02]
 
 
+def test_nerf_as_rays_are_cast_through_it(exporting):
+    """A pixel's ray is ((u - cx) / fl_x, -(v - cy) / fl_y, -1) turned by transform_matrix, from its last column."""
+    rig = ordinary("nerf")
+    lens = CameraIntrinsics(np.array([[700.0, 0, 319.5], [0, 710, 239.5], [0, 0, 1]]), np.array([0.1]), (640, 480))
+    content = json.loads(exporting.write(rig, "nerf", intrinsics={"cam0": lens, "cam1": lens}).read_text())
+    assert content["camera_model"] == "OPENCV"
+    assert [f["file_path"] for f in content["frames"]] == ["cam0.png", "cam1.png"]
+    for frame in content["frames"]:
+        name, T = frame["sensor"], np.array(frame["transform_matrix"])
+        assert [frame[k] for k in ("fl_x", "fl_y", "cx", "cy", "w", "h")] == [700, 710, 320, 240, 640, 480]
+        assert [frame[k] for k in ("k1", "k2", "p1", "p2")] == [0.1, 0, 0, 0]
+        u, v = 100.0, 50.0  # OpenCV's, whose first pixel is centred at 0
+        ray = T[:3, :3] @ [(u + 0.5 - frame["cx"]) / frame["fl_x"], -(v + 0.5 - frame["cy"]) / frame["fl_y"], -1.0]
+        point = [*(T[:3, 3] + 7.0 * ray), 1.0]
+        seen = lens.K @ (rig.between(name, "velo").T_a_b @ point)[:3]
+        assert np.allclose(seen, 7.0 * np.array([u, v, 1.0]))
+        assert "k3" not in frame
+    (velo, ins) = content["other_sensors"]
+    assert np.allclose(ins["T_base_sensor"], rig.between("velo", "ins").T_a_b, **WITHIN)
+    assert np.array_equal(velo["T_base_sensor"], np.eye(4))
+
+
+def test_a_nerf_says_who_does_not_read_its_last_coefficient(exporting):
+    lens = CameraIntrinsics(np.diag([700.0, 700, 1]), np.array([0.1, 0.2, 0.01, 0.02, 0.3]))
+    content = json.loads(exporting.write(ordinary("nerf"), "nerf", intrinsics={"cam1": lens}).read_text())
+    assert [content["frames"][1][k] for k in ("k1", "k2", "p1", "p2", "k3")] == [0.1, 0.2, 0.01, 0.02, 0.3]
+    assert "instant-ngp does not read k3" in content["comment"]
+
+
+def test_a_nerf_of_another_program(exporting, tmp_path):
+    """Frames by their images, in a world that no sensor is in."""
+    flip = np.diag([1.0, -1, -1, 1])
+    T = se3.matrix(np.random.default_rng(8).normal(size=(2, 6)))
+    images = ("images/left.jpg", "./images/right.jpg")
+    frames = [
+        {"file_path": f, "transform_matrix": (t @ flip).round(8).tolist()} for f, t in zip(images, T, strict=True)
+    ]
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 700, "frames": frames, "applied_scale": 1}))
+    rig = exporting.read(tmp_path / "transforms.json", "nerf")
+    assert rig.names == ("world", "images/left", "images/right")
+    assert not rig.has_scale[1:].any()
+    assert np.allclose(rig.between("images/left", "images/right").T_a_b, np.linalg.inv(T[0]) @ T[1], atol=1e-6)
+
+
 def test_autoware_as_its_description_puts_frames_together(exporting):
     """base to body by xyz and rpy about fixed axes, body to optical frame by rpy = -pi/2 0 -pi/2."""
     rig = ordinary("autoware")

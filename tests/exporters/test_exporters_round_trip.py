@@ -144,7 +144,7 @@ def test_one_sensor_alone_is_refused(exporting, format_id):
         exporting.write(make_rig(("cam0",), np.zeros((0, 6))), format_id)
 
 
-@pytest.mark.parametrize("format_id", ["kalibr", "kitti", "nuscenes", "colmap", "yaml"])
+@pytest.mark.parametrize("format_id", ["kalibr", "kitti", "nerf", "nuscenes", "colmap", "yaml"])
 def test_intrinsics_go_where_there_is_a_place_for_them(exporting, format_id, camera):
     path = exporting.write(ordinary(format_id), format_id, intrinsics={"cam0": camera})
     text = (path / "calib_cam_to_cam.txt" if path.is_dir() else path).read_text()
@@ -152,7 +152,7 @@ def test_intrinsics_go_where_there_is_a_place_for_them(exporting, format_id, cam
     assert same(ordinary(format_id), exporting.read(path, format_id))
 
 
-@pytest.mark.parametrize("format_id", ["kalibr", "kitti", "nuscenes", "colmap"])
+@pytest.mark.parametrize("format_id", ["kalibr", "kitti", "nerf", "nuscenes", "colmap"])
 def test_a_lens_that_a_format_can_not_hold_is_refused(exporting, format_id):
     wide = CameraIntrinsics(np.diag([700.0, 700.0, 1.0]), np.array([0.1, 0.2, 0, 0, 0.3, 0.1, 0.1, 0.1, 0.1]))
     with pytest.raises(DataError, match="cam0"):
@@ -168,6 +168,7 @@ def test_a_lens_that_a_format_can_not_hold_is_refused(exporting, format_id):
         ("kalibr", ("velo", "ins", "cam0"), "--sensors ins,cam0"),
         ("kalibr", ("velo", "ins"), "velo, ins are no cameras"),
         ("colmap", ("velo", "cam0", "cam1"), "--sensors cam0,cam1"),
+        ("nerf", ("velo", "ins"), "none of velo, ins is a camera"),
         ("autoware", ("velo", "sensor_kit_base_link"), "make it the base"),
         ("nuscenes", ("velo", "ego"), "make it the base"),
     ],
@@ -188,6 +189,9 @@ def test_a_rig_that_a_format_can_not_hold_is_refused(exporting, format_id, names
         ("kalibr", ("cam1", "ins", "cam0")),
         ("autoware", ("sensor_kit_base_link", "velo", "cam0")),
         ("autoware", ("cam0", "velo")),
+        ("nerf", ("cam0", "velo")),
+        ("nerf", ("cam1", "cam0")),
+        ("nerf", ("world", "cam0", "ins")),
         ("nuscenes", ("ego", "CAM_FRONT", "LIDAR_TOP")),
         ("nuscenes", ("cam0", "velo")),
     ],

@@ -16,6 +16,7 @@ import pluggy
 
 from calib_toolkit.errors import DataError, PluginError
 from calib_toolkit.hookspecs import CostMetric, Dataset, Exporter, HookSpecs, Metric, ReadContext, Sensor
+from calib_toolkit.packed import refuse_packed
 from calib_toolkit.types import Log
 
 GROUP = "calib_toolkit"
@@ -90,6 +91,8 @@ class Registry:
         found = found or [d for d in readers if d.last and d.matches(path)]
         if not path.exists() and not found:  # a path may go on inside a recording
             raise DataError(f"{path} does not exist; name the folder or file of a recording")
+        if not found:
+            refuse_packed(path)
         if format_id is not None:
             if format_id not in self.datasets:
                 raise DataError(f"no reader is called '{format_id}'; there are: {', '.join(self.datasets)}")

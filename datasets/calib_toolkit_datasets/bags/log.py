@@ -22,6 +22,8 @@ GENERIC = frozenset(
     )
 )
 """Last parts of topics that tell what they are and not whose."""
+MOST_TOPICS = 20
+"""Topics that a sentence names."""
 
 
 @hookimpl
@@ -59,8 +61,7 @@ def to_log(path: Path, bag: Bag) -> Log:
     clean = {n: replace(u, ns=u.ns + shifts.get(n, 0)) for n, u in clean.items()}
     made = sensors.streams(bag, clean, why)
     if not made:
-        reasons = [f"{name} ({r.channel.type}): {why[name]}" for name, r in bag.topics.items() if why[name]]
-        raise DataError(f"{path} holds no topic that a sensor reads: {'; '.join([*bag.notes, *reasons][:20])}")
+        raise DataError(_nothing(path, bag, why))
     names = _names(list(made))
     epoch_ns = min(int(m.ns[0]) for m in made.values())
     streams = {}
@@ -88,6 +89,17 @@ def to_log(path: Path, bag: Bag) -> Log:
         for name, r in sorted(bag.topics.items())
     )
     return Log(path, streams, epoch_ns, reference, tuple(notes), listed)
+
+
+def _nothing(path: Path, bag: Bag, why: Mapping[str, str]) -> str:
+    """What there is instead of sensors, and what would be read."""
+    there = [f"{name} ({messages.spoken(r.channel.type)}): {why[name]}" for name, r in sorted(bag.topics.items())]
+    more = [f"and {len(there) - MOST_TOPICS} topics more"] if len(there) > MOST_TOPICS else []
+    read = ", ".join(sorted(map(messages.spoken, sensors.KINDS)))
+    return (
+        f"{path} holds no topic that a sensor reads: {'; '.join([*bag.notes, *there[:MOST_TOPICS], *more])}; what is "
+        f"read are {read}: name a recording with some of them"
+    )
 
 
 def _names(topics: list[str]) -> dict[str, str]:

@@ -64,6 +64,11 @@ def short(kind: str) -> str:
     return kind.rpartition("/")[2]
 
 
+def spoken(kind: str) -> str:
+    """A type as people write it, without the part that ROS 2 put in."""
+    return kind.replace("/msg/", "/")
+
+
 def unreadable(channel: Channel) -> str:
     """Why messages of a channel can not be read, in a few words; "" if they can."""
     if channel.type not in READ:

@@ -65,8 +65,10 @@ def streams(bag: Bag, usable: Mapping[str, Usable], why: MutableMapping[str, str
     for topic in reader.of(poses.IMU):
         if topic not in taken:
             reader.attempt(made, topic, reader.gyro)
-    for topic in reader.of(INFO, *messages.FRAMES):
-        why.setdefault(topic, "")
+    for topic in reader.of(INFO):
+        why[topic] = why[topic] or "no images go with it"
+    for topic in reader.of(*messages.FRAMES):
+        why[topic] = "it tells where frames sit, and nothing that a sensor read"
     return made
 
 

@@ -6,7 +6,10 @@ import sys
 import pytest
 from small_runs import CAM, DEEP, VELO
 
-READERS = ("kitti-360", "kitti-raw", "multi-array-calib", "rig", "simulated")
+READERS = (
+    *("argoverse2", "euroc", "folder", "kitti-360", "kitti-odometry", "kitti-raw", "mcap", "multi-array-calib"),
+    *("nuscenes", "rig", "rosbag1", "rosbag2", "simulated", "tum"),
+)
 
 
 def options(tmp_path, text):

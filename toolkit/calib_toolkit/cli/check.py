@@ -55,9 +55,8 @@ def check(
     """
     from dataclasses import replace
 
-    from rich.console import Console
-
     from calib_toolkit.cli.bars import bars
+    from calib_toolkit.cli.screen import screen
     from calib_toolkit.config import Config, read_config
     from calib_toolkit.errors import DataError
     from calib_toolkit.pipeline import open_log
@@ -81,7 +80,7 @@ def check(
     notes += timed
     if out is not None:
         _write(found, notes, out)
-    console = Console(highlight=False)
+    console = screen()
     if found.judgements:
         console.print(
             "\nHow far each metric would move the first sensor, in axes of the second, and by how many standard "

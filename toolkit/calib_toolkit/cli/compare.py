@@ -32,9 +32,9 @@ def compare(ctx: click.Context, a: Path, b: Path) -> None:
     all that both determine). Exit status 0 if they agree, 3 if they differ, 1 if there is nothing to compare, with
     the reason.
     """
-    from rich.console import Console
 
     from calib_toolkit import comparison
+    from calib_toolkit.cli.screen import screen
     from calib_toolkit.errors import DataError
     from calib_toolkit.result_file import read_calibration
 
@@ -43,7 +43,7 @@ def compare(ctx: click.Context, a: Path, b: Path) -> None:
         found = comparison.compare(first, second)
     except DataError as e:
         raise DataError(f"{a} and {b} can not be compared: {e}") from e
-    console = Console(highlight=False)
+    console = screen()
     base = found.a.base
     console.print(f"\n{b} minus {a}, each sensor in {base}:", markup=False, soft_wrap=True)
     console.print(_table(found))

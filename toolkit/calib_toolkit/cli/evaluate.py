@@ -151,8 +151,9 @@ def evaluate(
 
 
 def _show(title: str, lines: list[list[str]]) -> None:
-    from rich.console import Console
     from rich.table import Table
+
+    from calib_toolkit.cli.screen import screen
 
     if not lines:
         return
@@ -164,7 +165,7 @@ def _show(title: str, lines: list[list[str]]) -> None:
         table.add_column(lines[0][k].replace(" ", "\n"), justify=side, no_wrap=True)
     for cells in lines[1:]:
         table.add_row(*(cells[k] for k in shown))
-    Console(highlight=False, markup=False).print(table, "")
+    screen(markup=False).print(table, "")
 
 
 def _names(sensors: str | None) -> list[str]:

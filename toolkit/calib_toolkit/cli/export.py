@@ -30,9 +30,9 @@ def export(
 ) -> None:
     """Write CALIBRATION.json in the format of another program.
 
-    FORMAT is autoware, colmap, csv, kalibr, kitti, nuscenes, ros2, urdf, yaml, or what a plugin brings. The file
-    says in a comment which way its transforms go, and where the clock offsets are: in the file, or in one that ends
-    in clocks.yaml beside it.
+    FORMAT is autoware, colmap, csv, kalibr, kitti, nerf, nuscenes, ros2, urdf, yaml, or what a plugin brings. The
+    file says in a comment which way its transforms go, and where the clock offsets are: in the file, or in one that
+    ends in clocks.yaml beside it.
 
     What the drive did not determine is null in csv and yaml; other formats refuse a sensor with an unknown pose,
     which --sensors can leave out. Without the base among them, all is given in the first of the sensors.

@@ -24,17 +24,17 @@ def inspect(ctx: click.Context, drive: Path, format_id: str | None, plugins: tup
     Exit status 0 if nothing is wrong, 3 if something is.
     """
     from rich.box import SIMPLE
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
+    from calib_toolkit.cli.screen import screen
     from calib_toolkit.inspection import inspect_log
     from calib_toolkit.pipeline import open_log
     from calib_toolkit.plugins import registry
 
     log = open_log(drive, format_id, registry(plugins))
     seen = inspect_log(log)
-    console = Console(highlight=False)
+    console = screen()
     console.print(f"{seen.source}: {seen.duration:.1f} s{_date(log.epoch_ns)}", markup=False, soft_wrap=True)
     table = Table("sensor", "kind", box=SIMPLE)
     for column in ("readings", "rate Hz", "start s", "end s", "gaps", "longest s"):

@@ -10,14 +10,14 @@ import click
 def plugins(files: tuple[Path, ...]) -> None:
     """List every sensor, metric, dataset reader and exporter: its distribution, version and source file."""
     from rich.box import SIMPLE
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
+    from calib_toolkit.cli.screen import screen
     from calib_toolkit.plugins import registry
 
     table = Table("id", "kind", "distribution", "version", box=SIMPLE)
     table.add_column("source", overflow="fold")
     for e in sorted(registry(files).entries, key=lambda e: (e.kind, e.id)):
         table.add_row(*map(escape, (e.id, e.kind, e.distribution, e.version, e.source)))
-    Console(highlight=False).print(table)
+    screen().print(table)

@@ -61,10 +61,9 @@ def run(
     """
     from dataclasses import replace
 
-    from rich.console import Console
-
     from calib_toolkit.cli.bars import bars
     from calib_toolkit.cli.chosen import sensor_names
+    from calib_toolkit.cli.screen import screen
     from calib_toolkit.cli.tables import show_result
     from calib_toolkit.config import Config, read_config
     from calib_toolkit.pipeline import calibrate, open_log
@@ -87,7 +86,7 @@ def run(
     if file is not None:
         write_result(result, file)
     span = log.trim(config.start, config.duration).span
-    show_result(result, Console(highlight=False), log.reference, sum(span) / 2)
+    show_result(result, screen(), log.reference, sum(span) / 2)
     if file is not None:
         click.echo(f"written: {file}")
     if pictures and any(p.stat().st_mtime >= started for p in pictures.glob("*")):  # not those of an earlier run

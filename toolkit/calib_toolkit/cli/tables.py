@@ -13,8 +13,8 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from calib_toolkit import delta, se3
-from calib_toolkit.joint.report import WANTED
 from calib_toolkit.types import Calibration, Result
+from calib_toolkit.types.calibration import WANTED
 
 Array = NDArray[np.float64]
 COLUMNS = ("x\nm", "y\nm", "z\nm", "roll\ndeg", "pitch\ndeg", "yaw\ndeg", "dt\nms")

@@ -12,12 +12,9 @@ from calib_toolkit.joint.readings import WIDENED
 from calib_toolkit.joint.turning import Turning
 from calib_toolkit.sync import Steps
 from calib_toolkit.types import Calibration, Measured, Motions
-from calib_toolkit.types.calibration import PARAMETERS
+from calib_toolkit.types.calibration import PARAMETERS, WANTED
 
 Array = NDArray[np.float64]
-
-WANTED = {"x": 0.02, "y": 0.02, "z": 0.02, "rx": 1e-3, "ry": 1e-3, "rz": 1e-3, "dt": 1e-3}
-"""Sigma that most uses of a calibration ask for: metres, radians, seconds."""
 
 
 def statistics(

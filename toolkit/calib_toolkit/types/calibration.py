@@ -12,6 +12,8 @@ Array = NDArray[np.float64]
 
 PARAMETERS = ("x", "y", "z", "rx", "ry", "rz", "dt")
 """One sensor's parameters, in the order of every joint covariance: metres, radians (delta), seconds."""
+WANTED = {"x": 0.02, "y": 0.02, "z": 0.02, "rx": 1e-3, "ry": 1e-3, "rz": 1e-3, "dt": 1e-3}
+"""Sigma that most uses of a calibration ask for: metres, radians, seconds."""
 
 
 @dataclass(frozen=True)
