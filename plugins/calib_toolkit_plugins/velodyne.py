@@ -18,6 +18,9 @@ LEAN = float(np.radians(0.02))
 LATE = 0.01
 """Of a sweep, by which motion seems late: what is seen ahead is not seen when what is seen behind is, so that the
 instant at which a sweep shows roll and pitch depends on where there is something to see."""
+LOCAL = 300_000
+"""Points, about, of the last sweeps, on which the next one is laid: with few beams most of the ground lies between
+the rings of a single sweep, and rings that lie on rings hide half of all roll and pitch."""
 COARSER = 2.0
 """How many times larger the cells of the first pass are."""
 
@@ -51,7 +54,7 @@ class VelodyneOptions:
 @hookimpl
 def calib_register_sensors() -> list[Sensor]:
     """The ``velodyne`` sensor."""
-    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="5")]
+    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="6")]
 
 
 def estimate(stream: Stream, options: VelodyneOptions) -> Motions:
@@ -59,15 +62,15 @@ def estimate(stream: Stream, options: VelodyneOptions) -> Motions:
 
     Two passes. In the first, a coarse one, the previous motion is the first guess and moves the points of a sweep
     to its stamp, as in the paper; but roll and pitch change within a sweep, so the second moves them by the mean of
-    the motions before and after. A step that fails (too few points, too little overlap, a jump) is left out.
+    the motions before and after. It lays each sweep on the last few, which the motions found bring together: on one
+    if that is dense enough. A step that fails (too few points, too little overlap, a jump) is left out.
     Raises DataError with fewer than two readings, or one that is not a scan.
     """
     if len(stream) < 2:
         raise DataError(f"sensor {stream.name}: a motion takes two scans, and there are {len(stream)}")
-    if not options.deskew or getattr(stream.readings[0], "times", None) is None:
-        return _motions(stream, _checked(stream, options, *_first_pass(stream, options)))
-    coarse = replace(options, cell=COARSER * options.cell)
-    first = _checked(stream, options, *_first_pass(stream, coarse))
+    timed = options.deskew and getattr(stream.readings[0], "times", None) is not None
+    coarse = replace(options, cell=COARSER * options.cell) if timed else options
+    first = _checked(stream, coarse, *_first_pass(stream, coarse))
     return _motions(stream, _second_pass(stream, options, first))
 
 
@@ -114,11 +117,15 @@ class _Sweep:
     def enough(self) -> bool:
         return len(self.points) >= self.options.min_points
 
+    def at_stamp(self, velocity: Array | None) -> Array:
+        """Its points (n, 3), moved by a velocity (6,) to the stamp."""
+        if velocity is None or self.times is None:
+            return self.points
+        return deskew(self.points, self.times, velocity)
+
     def surface(self, velocity: Array | None) -> Surface:
         """What it saw, its points moved by a velocity (6,) to the stamp."""
-        if velocity is None or self.times is None:
-            return registration.surface(self.points, self.options.cell)
-        return registration.surface(deskew(self.points, self.times, velocity), self.options.cell)
+        return registration.surface(self.at_stamp(velocity), self.options.cell)
 
 
 _Step = tuple[Array, Array] | None
@@ -160,24 +167,63 @@ def _first_pass(stream: Stream, options: VelodyneOptions) -> tuple[list[_Step], 
 
 
 def _second_pass(stream: Stream, options: VelodyneOptions, first: list[_Step]) -> list[_Step]:
-    """The steps of the first pass once more, each sweep moved by the mean velocity of the steps around it."""
+    """The steps of the first pass once more: each sweep, moved by the mean velocity of the steps around it, on the
+    last ones; or, where there are not enough of those yet, the sweep before on the next ones."""
     dt = np.diff(stream.stamps)
     velocity = [None if s is None else se3.vector(s[0]) / t for s, t in zip(first, dt, strict=True)]
-    steps: list[_Step] = []
-    made: tuple[int, Surface] | None = None
-    for k, seen in enumerate(first):
-        if seen is None:
-            steps.append(None)
+
+    def points(k: int) -> Array:
+        around = [v for v in velocity[max(k - 1, 0) : k + 1] if v is not None]
+        return _Sweep.read(stream, k, options).at_stamp(np.mean(around, axis=0) if around else None)
+
+    steps, early = list(first), []
+    last: list[Array] = []  # the newest first, all where the scanner was at its stamp
+    for k, seed in enumerate(first):
+        if seed is None:
+            last = []
             continue
-        before, after = (_mean(velocity[max(i - 1, 0) : i + 1]) for i in (k, k + 1))
-        a = made[1] if made is not None and made[0] == k else _Sweep.read(stream, k, options).surface(before)
-        made = (k + 1, _Sweep.read(stream, k + 1, options).surface(after))
-        steps.append(_step(a, made[1], seen[0], options))
+        last = last or [points(k)]
+        if sum(map(len, last)) < LOCAL:
+            early.append(k)
+        curr = points(k + 1)
+        steps[k] = step = _on(last, curr, seed[0], options)
+        last = [] if step is None else _enough([curr, *_moved(last, se3.invert(step[0]))])
+    for k in reversed(early):
+        if (step := steps[k]) is not None:
+            later = [points(k + 1)]
+            T = np.eye(4)
+            for i in range(k + 1, len(steps)):
+                if (next_ := steps[i]) is None or sum(map(len, later)) >= LOCAL:
+                    break
+                T = T @ next_[0]
+                later += _moved([points(i + 1)], T)
+            back = _on(later, points(k), se3.invert(step[0]), options) if len(later) > 1 else None
+            steps[k] = step if back is None else _inverse(*back)
     return steps
 
 
-def _mean(velocities: Sequence[Array | None]) -> Array:
-    return np.mean([v for v in velocities if v is not None], axis=0)
+def _on(clouds: Sequence[Array], curr: Array, T_seed: Array, options: VelodyneOptions) -> _Step:
+    """A sweep (n, 3) laid on clouds that are in one frame."""
+    surface = registration.surface(np.concatenate(clouds), options.cell)
+    return _step(surface, registration.surface(curr, options.cell), T_seed, options)
+
+
+def _enough(clouds: list[Array]) -> list[Array]:
+    """The first clouds, as many as make a local map."""
+    total = np.cumsum([len(c) for c in clouds])
+    return clouds[: int(np.searchsorted(total, LOCAL)) + 1]
+
+
+def _inverse(T: Array, cov: Array) -> tuple[Array, Array]:
+    """A motion the other way round, with the covariance (6, 6) of its ``vec``."""
+    back = se3.invert(T)
+    J = np.linalg.inv(se3.vec_jacobian(se3.vector(back))) @ se3.relative_jacobians(T, np.eye(4))[0]
+    J = J @ se3.vec_jacobian(se3.vector(T))
+    return back, J @ cov @ J.T
+
+
+def _moved(clouds: Sequence[Array], T: Array) -> list[Array]:
+    return [p @ T[:3, :3].T + T[:3, 3] for p in clouds]
 
 
 def _step(prev: Surface, curr: Surface, T_seed: Array, options: VelodyneOptions) -> _Step:
