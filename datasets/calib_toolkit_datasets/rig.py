@@ -116,12 +116,8 @@ def _from_log(name: str, table: _Keys, file: Path, context: ReadContext, opened:
     theirs = table.get("sensor", name)
     if not isinstance(table["log"], str) or not isinstance(theirs, str):
         raise DataError(f"{table.where}: 'log' and 'sensor' must be strings")
-    try:
-        path = (file.absolute().parent / expanduser(table["log"])).resolve()
-        is_rig = matches(path)
-    except OSError as e:
-        raise DataError(f"{table.where}: log = {table['log']!r} can be no path ({e.strerror}); correct it") from e
-    if is_rig:  # two of them could name each other for ever
+    path = (file.absolute().parent / expanduser(table["log"])).resolve()
+    if matches(path):  # two of them could name each other for ever
         raise DataError(f"{table.where}: {path} is a rig itself; copy the tables that are wanted from its {FILE}")
     try:
         log = opened.get(path) or context.open_log(path)
