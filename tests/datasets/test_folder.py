@@ -67,6 +67,12 @@ def test_columns_of_poses_are_known_by_their_titles(whole):
         np.testing.assert_allclose(log.streams[name].readings[7].T_world_sensor, build.drive(12)[7], atol=1e-8)
 
 
+def test_a_table_whose_titles_are_not_known_is_named(tmp_path):
+    root = build.folder(tmp_path / "a", 4)
+    (root / "gps.csv").write_text((root / "gps.csv").read_text().replace("lat_deg", "lat_d{g"))
+    assert "gps is left out: its first line, 'stamp,lat_d{g,lon_deg" in said(opened(root))
+
+
 def test_intrinsics_are_those_of_ros_file_and_a_missing_one_is_named(whole):
     log = opened(whole)
     camera = log.streams["front"].intrinsics
