@@ -98,7 +98,9 @@ def _pcd(file: Path) -> dict[str, NDArray[Any]]:
     n = int((said.get("POINTS") or said.get("WIDTH") or ["0"])[0])
     kinds = [PCD_TYPES.get(t + s, "") for t, s in zip(types, sizes, strict=False)]
     fit = len(names) == len(counts) == len(kinds) and all(kinds) and all(0 < c < 10_000 for c in counts)
-    if not fit or n < 1:
+    if fit and n < 1:
+        raise ValueError("it says that it holds no points")
+    if not fit:
         raise ValueError("its header does not say fields, sizes, types, counts and points that fit one another")
     if head[1] == b"binary_compressed":
         return _compressed(file)
@@ -180,6 +182,7 @@ def _las(file: Path) -> dict[str, NDArray[Any]]:
         raise DataError(f"{file} can not be read without laspy; pip install 'calib-toolkit[las]'") from e
     logging.getLogger("laspy").setLevel(logging.CRITICAL)  # what it says of damage, our sentence says
     try:
+        _refuse_endless(file)
         with laspy.open(file) as opened:
             if not 0 < opened.header.point_count <= DENSEST * file.stat().st_size:
                 raise ValueError(f"it says {opened.header.point_count} points in {file.stat().st_size} bytes")
@@ -191,6 +194,20 @@ def _las(file: Path) -> dict[str, NDArray[Any]]:
         raise
     except BaseException as e:  # a damaged file makes laspy raise anything, and its unpacker panic
         raise ValueError(f"{type(e).__name__}: {e}") from e
+
+
+def _refuse_endless(file: Path) -> None:
+    """Unpackers make room for as many chunks as a .laz says, and end the process where there is none."""
+    raw = np.memmap(file, np.uint8, "r")
+    if len(raw) < 105 or not raw[104] & 128:
+        return  # not packed, or no header at all, which laspy says better
+    at = int(raw[96:100].view("<u4")[0])
+    table = int.from_bytes(raw[at : at + 8].tobytes(), "little", signed=True)
+    if table == -1:  # what was written without going back has the place at its end
+        table = int.from_bytes(raw[-8:].tobytes(), "little", signed=True)
+    chunks = int.from_bytes(raw[table + 4 : table + 8].tobytes(), "little") if 0 < table < len(raw) else 0
+    if chunks > len(raw):
+        raise ValueError(f"it says {chunks} chunks in {len(raw)} bytes")
 
 
 _READERS = {".bin": _bin, ".npy": _npy, ".pcd": _pcd, ".ply": _ply, ".las": _las, ".laz": _las}

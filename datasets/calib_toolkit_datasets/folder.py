@@ -23,6 +23,8 @@ from calib_toolkit_datasets.merging import from_table, merged, refuse_leaving
 from calib_toolkit_datasets.yaml_files import read_yaml
 
 IMAGES = (".png", ".jpg", ".jpeg")
+TABLES = (".csv", ".tum")
+"""Texts that are nothing else than tables."""
 TEXTS = (".txt", ".csv", ".tum")
 INFO = "camera_info.yaml"
 HEAD = re.compile(r"(?:head|cam)_?(\d+)")
@@ -60,6 +62,9 @@ def open_log(path: Path, context: ReadContext) -> Log:
             if kind:
                 refuse_leaving(path, [entry])
                 logs.append(_OPEN[kind](entry, context))
+            elif entry.suffix.lower() in TABLES and entry.is_file():
+                refuse_leaving(path, [entry])
+                raise DataError(f"its first line, '{_first_line(entry)[:80]}', is none of poses or fixes; mend it")
         except DataError as e:
             notes.append(f"{entry.stem if entry.is_file() else entry.name} is left out: {e}")
     if not logs:

@@ -132,7 +132,9 @@ def _reference(folder: Path, streams: dict[str, Stream]) -> Calibration | None:
         return None
     try:
         T_velo_cam = np.eye(4)
-        T_velo_cam[:3] = np.loadtxt(file).reshape(3, 4)
+        T_velo_cam[:3] = np.array(file.read_text().split(), dtype=np.float64).reshape(3, 4)
+        if not np.all(np.abs(T_velo_cam) < kitti_files.FARTHEST):
+            raise ValueError("some are not metres")
     except (OSError, ValueError) as e:
         raise DataError(f"{file} must hold 12 numbers ({e}); fetch the calibration again") from e
     calib = kitti_files.read_calib(rectification)

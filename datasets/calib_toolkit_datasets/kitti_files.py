@@ -13,6 +13,10 @@ from calib_toolkit.errors import DataError
 from calib_toolkit.types import Calibration
 
 Array = NDArray[np.float64]
+FARTHEST = 1e6
+"""Metres from one sensor to another that no vehicle has."""
+ROUNDED = 1e-4
+"""How far a published matrix may be from a rotation: it has seven digits."""
 
 
 @dataclass(frozen=True)
@@ -112,10 +116,17 @@ def reference(T_velo_sensor: Mapping[str, Array], without_scale: Sequence[str] =
     """The shipped poses as a calibration with base velo, or None if there are none.
 
     T_velo_sensor: (4, 4) by sensor name. Such files state neither uncertainty nor clock offsets: the
-    covariance is zero and dt is not determined.
+    covariance is zero and dt is not determined. Raises DataError where a rotation is none.
     """
     if not T_velo_sensor:
         return None
+    for name, T in T_velo_sensor.items():
+        R = T[:3, :3]
+        if not np.all(np.abs(T) < FARTHEST) or np.abs(R @ R.T - np.eye(3)).max() > ROUNDED or np.linalg.det(R) < 0:
+            raise DataError(
+                f"sensor {name}: the calibration files beside the drive turn it by a matrix that is no rotation; "
+                "fetch them again"
+            )
     names = ("velo", *T_velo_sensor)
     determined = np.ones((len(names), 7), dtype=bool)
     determined[1:, 6] = False

@@ -15,10 +15,13 @@ from numpy.typing import NDArray
 
 from calib_toolkit import CameraIntrinsics, Dataset, Log, MotionReading, ReadContext, Stream, hookimpl, se3, tables
 from calib_toolkit.errors import DataError
+from calib_toolkit_datasets import mat_files
 
 Array = NDArray[np.float64]
 
 FAILED_VARIANCE = 1000.0
+FARTHEST = 1e6
+"""Metres from one frame to the next: beyond are damaged numbers, and nan is not below it either."""
 _NAME = re.compile(r".*?(Vel|Nav|Cam(?P<number>\d+))Data\.mat", re.DOTALL)
 
 
@@ -97,7 +100,7 @@ def _table(
             f"{file}: sensor {name} has {len(ns)} stamps, {len(vec)} motions and {len(variance)} variances; "
             "all must be as many"
         )
-    usable = np.all(np.isfinite(vec) & np.isfinite(variance) & (variance > 0) & (variance < FAILED_VARIANCE), axis=1)
+    usable = np.all((np.abs(vec) < FARTHEST) & (variance > 0) & (variance < FAILED_VARIANCE), axis=1)
     keep = tables.increasing(ns)
     usable[1:] &= keep[:-1]  # what follows a dropped reading is not the motion since the reading kept before it
     usable[0] = False
@@ -115,6 +118,7 @@ def _loaded(name: str, file: Path) -> Any:
     from scipy.io import loadmat
 
     try:
+        mat_files.refuse_damage(file.read_bytes())
         variables = loadmat(file, squeeze_me=True, struct_as_record=False)
         (data,) = [v for v in variables.values() if hasattr(v, "T_Skm1_Sk")]
         _ = data.T_Var_Skm1_Sk, data.time

@@ -179,6 +179,11 @@ def test_a_broken_plugin_is_refused_by_name_in_one_sentence(
     assert "\n" not in str(refusal.value)
 
 
+def test_a_name_that_is_too_long_is_refused() -> None:
+    with pytest.raises(DataError, match=r"9\.\.\.9+ can not be looked up .*; correct the path"):
+        registry().open_log(Path("9" * 5000))
+
+
 def test_a_file_that_is_not_there_is_refused(install: Install, tmp_path: Path) -> None:
     with pytest.raises(PluginError, match=r"absent\.py: there is no such file"):
         registry([tmp_path / "absent.py"])

@@ -48,6 +48,12 @@ def test_a_path_that_is_missing_or_no_path_is_asked_for(tmp_path: Path, value: A
         tables.table_file(given, "fixes")
 
 
+def test_a_path_that_is_too_long_is_not_there_and_is_not_repeated_at_length(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"there is no file .*\.\.\.") as refusal:
+        tables.table_file(table(tmp_path, fixes="9" * 5000), "fixes")
+    assert len(str(refusal.value)) < 1000
+
+
 def test_a_file_is_no_folder_and_a_folder_no_file(tmp_path: Path) -> None:
     written(tmp_path, "1")
     with pytest.raises(DataError, match=r"sensor ins: scans = 'table.txt', but there is no folder .*table\.txt"):

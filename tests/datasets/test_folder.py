@@ -67,6 +67,12 @@ def test_columns_of_poses_are_known_by_their_titles(whole):
         np.testing.assert_allclose(log.streams[name].readings[7].T_world_sensor, build.drive(12)[7], atol=1e-8)
 
 
+def test_a_table_whose_titles_are_not_known_is_named(tmp_path):
+    root = build.folder(tmp_path / "a", 4)
+    (root / "gps.csv").write_text((root / "gps.csv").read_text().replace("lat_deg", "lat_d{g"))
+    assert "gps is left out: its first line, 'stamp,lat_d{g,lon_deg" in said(opened(root))
+
+
 def test_intrinsics_are_those_of_ros_file_and_a_missing_one_is_named(whole):
     log = opened(whole)
     camera = log.streams["front"].intrinsics
@@ -130,6 +136,7 @@ def test_numbers_are_no_stamps(tmp_path):
         (".pcd", b"FIELDS x y\nSIZE 4 4\nTYPE F F\nPOINTS 1\nDATA ascii\n1 2\n", "no field 'z'"),
         (".pcd", b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 9\nDATA binary\n" + bytes(12), "says 9 points"),
         (".pcd", b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 99999999999\nDATA binary\n", "says 9+ points"),
+        (".pcd", b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 0\nDATA binary\n", "holds no points"),
         (".ply", b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nend_header\n1\n", "says 2 points"),
         (".ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n1\n", "no single"),
         (".npy", b"\x93NUMPY", "ValueError"),
@@ -141,6 +148,17 @@ def test_a_cloud_that_can_not_be_used_is_refused_by_name(tmp_path, suffix, conte
     file.write_bytes(content)
     with pytest.raises(DataError, match=rf"1{suffix}: sensor velo: the cloud can not be read \(.*({says})"):
         cloud_files.read_columns(file, "velo")
+
+
+def test_a_laz_that_says_chunks_without_end_is_refused(tmp_path):
+    build.las(tmp_path / "1.laz", build.cloud(0))
+    raw = bytearray((tmp_path / "1.laz").read_bytes())
+    points = int.from_bytes(raw[96:100], "little")
+    table = int.from_bytes(raw[points : points + 8], "little")
+    raw[table + 4 : table + 8] = b"\xf9" * 4
+    (tmp_path / "1.laz").write_bytes(raw)
+    with pytest.raises(DataError, match=r"1\.laz: .* says 4193909241 chunks"):
+        cloud_files.read_columns(tmp_path / "1.laz", "velo")
 
 
 class Evil:

@@ -143,6 +143,20 @@ def test_a_truncated_scan_is_named(flat: Path) -> None:
         opened(flat).streams["velo"].readings[1]
 
 
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "must hold 12 numbers"),
+        (CAM_TO_VELO.replace("0.8", "inf"), "12 numbers"),
+        ("9" + CAM_TO_VELO, "no rotation"),
+    ],
+)
+def test_a_damaged_extrinsic_is_refused(flat: Path, text: str, says: str) -> None:
+    (flat / "calibration/calib_cam_to_velo.txt").write_text(text)
+    with pytest.raises(DataError, match=says):
+        opened(flat)
+
+
 def test_the_real_frames(recordings: Path) -> None:
     path = recordings / "kitti360-3000"
     known_by = [m.__name__ for m in (kitti_raw, kitti_360, multi_array_calib, rig) if m.matches(path)]

@@ -76,6 +76,16 @@ def test_images_of_another_size_than_the_calibration_says(write_drive: DriveWrit
         opened(drive).streams["cam0"].readings[0]
 
 
+def test_a_rotation_with_a_damaged_number_is_no_reference(write_drive: DriveWriter) -> None:
+    file = write_drive().parent / "calib_imu_to_velo.txt"
+    drive = next(file.parent.glob("*_sync"))
+    whole = file.read_text()
+    assert whole.count("R: 9.99") == 1
+    file.write_text(whole.replace("R: 9.99", "R: 9.89"))
+    with pytest.raises(DataError, match=r"sensor ins: .* no rotation; fetch them again"):
+        opened(drive)
+
+
 def test_a_damaged_calibration_file_is_named(write_drive: DriveWriter) -> None:
     drive = write_drive()
     (drive.parent / "calib_velo_to_cam.txt").write_text("R: 1 2 3\n")

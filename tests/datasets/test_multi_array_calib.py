@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.io import savemat
+from scipy.io import loadmat, savemat
 
 from calib_toolkit import Log, ReadContext, se3
 from calib_toolkit.errors import DataError
@@ -145,6 +145,47 @@ def test_damaged_files_are_named(tmp_path: Path) -> None:
         opened(tmp_path)
     write(tmp_path, "TestVel", "velData", motions(4), time=np.arange(3, dtype=np.uint64))
     with pytest.raises(DataError, match="sensor velo has 3 stamps, 4 motions"):
+        opened(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("at", "content"),
+    [
+        (0, b"\0"),  # a type that SciPy's table of types does not have
+        (0, b"\x0e"),  # a matrix where numbers belong
+        (4, b"\xff\xff"),  # more bytes than there are
+    ],
+)
+def test_an_element_that_would_end_the_process_is_refused(tmp_path: Path, at: int, content: bytes) -> None:
+    file = write(tmp_path, "TestVel", "velData", motions(4))
+    raw = bytearray(file.read_bytes())
+    numbers = raw.index(b"\x09\0\0\0")  # doubles
+    raw[numbers + at : numbers + at + len(content)] = content
+    file.write_bytes(raw)
+    with pytest.raises(DataError, match=r"TestVelData\.mat: sensor velo can not be read \(ValueError"):
+        opened(tmp_path)
+
+
+def test_structs_without_end_are_not_made(tmp_path: Path) -> None:
+    file = write(tmp_path, "TestVel", "velData", motions(4))
+    raw = bytearray(file.read_bytes())
+    raw[167] = 16  # the second size of the struct, 1, becomes 268435457
+    file.write_bytes(raw)
+    with pytest.raises(DataError, match=r"sensor velo can not be read \(ValueError"):
+        opened(tmp_path)
+
+
+def test_packed_files_are_read_and_lie_no_deeper_than_is_sane(tmp_path: Path) -> None:
+    write(tmp_path, "TestVel", "velData", motions(9))
+    whole = opened(tmp_path).streams["velo"].readings[3].vec
+    content = loadmat(tmp_path / "TestVelData.mat")
+    savemat(tmp_path / "TestVelData.mat", {"velData": content["velData"]}, do_compression=True)
+    np.testing.assert_array_equal(opened(tmp_path).streams["velo"].readings[3].vec, whole)
+    nested: dict[str, object] = {"a": 1}
+    for _ in range(40):
+        nested = {"a": nested}
+    savemat(tmp_path / "TestVelData.mat", {"velData": nested})
+    with pytest.raises(DataError, match=r"sensor velo can not be read \(ValueError"):
         opened(tmp_path)
 
 

@@ -85,6 +85,10 @@ class Registry:
     def open_log(self, path: Path, format_id: str | None = None, **options: Any) -> Log:
         """The recording at a path, by the reader named or the one that recognises it. Raises DataError."""
         path = Path(path)
+        try:
+            path.exists()
+        except OSError as e:  # of a name that is too long, or a folder that may not be looked into
+            raise DataError(f"{path} can not be looked up ({e.strerror}); correct the path") from e
         context = ReadContext(self.sensors, self.open_log, options)
         readers = sorted(self.datasets.values(), key=lambda d: d.last)
         found = [d for d in readers if not d.last and d.matches(path)]

@@ -150,7 +150,11 @@ def _path(table: SensorTable, key: str, what: str, exists: Callable[[Path], bool
     if not isinstance(value, str):
         raise DataError(f'sensor {table.name} needs {key} = "{what.upper()}", a path in quotes')
     path = table.folder / expanduser(value)
-    if not exists(path):
+    try:
+        found = exists(path)
+    except OSError:  # of names that are too long
+        found = False
+    if not found:
         raise DataError(f"sensor {table.name}: {key} = {value!r}, but there is no {what} {path}; correct the path")
     return path
 
