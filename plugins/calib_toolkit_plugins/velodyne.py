@@ -18,6 +18,8 @@ LEAN = float(np.radians(0.02))
 LATE = 0.01
 """Of a sweep, by which motion seems late: what is seen ahead is not seen when what is seen behind is, so that the
 instant at which a sweep shows roll and pitch depends on where there is something to see."""
+ASIDE = 0.2
+"""Of the time from the stamp to the middle of what is seen: so far a motion within a tenth of a second is known."""
 LOCAL = 300_000
 """Points, about, of the last sweeps, on which the next one is laid: with few beams most of the ground lies between
 the rings of a single sweep, and rings that lie on rings hide half of all roll and pitch."""
@@ -245,4 +247,11 @@ def _motions(stream: Stream, steps: Sequence[_Step]) -> Motions:
         return Motions(np.zeros(0), np.zeros(0), np.zeros((0, 6)), np.zeros((0, 6, 6)))
     k, T, cov = (np.array(column) for column in zip(*found, strict=True))
     start, end = stream.stamps[k], stream.stamps[k + 1]
-    return Motions(start, end, se3.vector(T), cov, lean=np.full(3, LEAN), late=LATE * stream.period)
+    return Motions(start, end, se3.vector(T), cov, lean=np.full(3, LEAN), late=_late(stream))
+
+
+def _late(stream: Stream) -> float:
+    """Seconds by which the motion may seem late, as a few scans show."""
+    looked = (stream.readings[int(k)] for k in np.linspace(0, len(stream) - 1, 5))
+    aside = [float(np.nanmean(s.times)) for s in looked if s.times is not None and len(s.times)]
+    return float(np.hypot(LATE * stream.period, ASIDE * np.mean(aside))) if aside else LATE * stream.period

@@ -33,10 +33,12 @@ def street(seed: int) -> Array:
     return np.array(boxes)
 
 
-def sweep(boxes: Array, T_world_mid: Array, step: Array, rng: np.random.Generator, sigma: float) -> Scan:
+def sweep(
+    boxes: Array, T_world_mid: Array, step: Array, rng: np.random.Generator, sigma: float, rings: int = BEAMS
+) -> Scan:
     """One clockwise sweep of a scanner that moves by ``step`` a period; its stamp is the middle."""
     azimuth = -np.pi + (np.arange(COLUMNS) + 0.5) * 2 * np.pi / COLUMNS
-    azimuth, elevation = (m.ravel() for m in np.meshgrid(azimuth, np.radians(np.linspace(-24.8, 2, BEAMS))))
+    azimuth, elevation = (m.ravel() for m in np.meshgrid(azimuth, np.radians(np.linspace(-24.8, 2, rings))))
     part = -azimuth / (2 * np.pi)
     beams = np.stack(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=1

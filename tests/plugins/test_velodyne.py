@@ -54,6 +54,26 @@ def test_the_motions_before_and_after_keep_wobble_out() -> None:
     assert error < 0.0006  # 0.0017 with the motion before alone
 
 
+def test_few_beams_show_roll_and_pitch() -> None:
+    """Rings that are laid on those of the sweep before would follow the scanner instead of the ground."""
+    rng, turns = np.random.default_rng(0), np.random.default_rng(1).normal(0.0, 0.004, (14, 2))
+    steps = np.array([[0.8, 0, 0, *turn, 0] for turn in np.diff(turns, axis=0)])
+    poses = [se3.matrix(np.array([0, 0, 0, *turns[0], 0]))]
+    for step in steps:
+        poses.append(poses[-1] @ se3.matrix(step))
+    readings = [sweep(street(5), T, np.array([0.8, 0, 0, 0, 0, 0]), rng, 0.01, rings=8) for T in poses]
+    found = estimate(Stream("velo", "velodyne", PERIOD * np.arange(14), readings), VelodyneOptions()).vec
+    shown = np.sum(found[:, 3:5] * steps[:, 3:5], axis=0) / np.sum(steps[:, 3:5] ** 2, axis=0)
+    assert np.all(shown > 0.9)  # 0.43 when laid on one sweep
+
+
+def test_motion_seems_later_the_further_what_is_seen_is_from_the_stamp(stream: Stream) -> None:
+    ahead = [Scan(s.points[s.times > 0.01], s.times[s.times > 0.01]) for s in stream.readings]
+    whole, part = (estimate(replace(stream, readings=r), VelodyneOptions()).late for r in (stream.readings, ahead))
+    assert whole == pytest.approx(0.001, rel=0.2)
+    assert part == pytest.approx(0.006, rel=0.2)
+
+
 def test_points_are_moved_to_where_they_were_at_the_stamp() -> None:
     rng = np.random.default_rng(0)
     still, times = rng.uniform(-50, 50, (100, 3)), rng.uniform(-0.05, 0.05, 100)
