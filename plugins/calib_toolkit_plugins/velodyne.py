@@ -20,8 +20,8 @@ LATE = 0.01
 instant at which a sweep shows roll and pitch depends on where there is something to see."""
 ASIDE = 0.2
 """Of the time from the stamp to the middle of what is seen: so far a motion within a tenth of a second is known."""
-LOCAL = 300_000
-"""Points, about, of the last sweeps, on which the next one is laid: with few beams most of the ground lies between
+LOCAL = 60_000
+"""Cells, about, of the last sweeps, on which the next one is laid: with few beams most of the ground lies between
 the rings of a single sweep, and rings that lie on rings hide half of all roll and pitch."""
 COARSER = 2.0
 """How many times larger the cells of the first pass are."""
@@ -56,24 +56,26 @@ class VelodyneOptions:
 @hookimpl
 def calib_register_sensors() -> list[Sensor]:
     """The ``velodyne`` sensor."""
-    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="6")]
+    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="7")]
 
 
 def estimate(stream: Stream, options: VelodyneOptions) -> Motions:
     """``T_prev_curr`` between the stamps of successive ``Scan`` readings, with the covariance of range noise.
 
-    Two passes. In the first, a coarse one, the previous motion is the first guess and moves the points of a sweep
-    to its stamp, as in the paper; but roll and pitch change within a sweep, so the second moves them by the mean of
-    the motions before and after. It lays each sweep on the last few, which the motions found bring together: on one
-    if that is dense enough. A step that fails (too few points, too little overlap, a jump) is left out.
+    Three passes. In the first, a coarse one, the previous motion is the first guess and moves the points of a sweep
+    to its stamp, as in the paper; but roll and pitch change within a sweep, so the others move them as fast as the
+    motions before and after say. They lay each sweep on the last few, which those motions bring together; the second
+    is coarse, too. A step that fails (too few points, too little overlap, a jump) is left out.
     Raises DataError with fewer than two readings, or one that is not a scan.
     """
     if len(stream) < 2:
         raise DataError(f"sensor {stream.name}: a motion takes two scans, and there are {len(stream)}")
     timed = options.deskew and getattr(stream.readings[0], "times", None) is not None
     coarse = replace(options, cell=COARSER * options.cell) if timed else options
-    first = _checked(stream, coarse, *_first_pass(stream, coarse))
-    return _motions(stream, _second_pass(stream, options, first))
+    steps = _checked(stream, coarse, *_first_pass(stream, coarse))
+    if timed:
+        steps = _again(stream, coarse, steps)
+    return _motions(stream, _again(stream, options, steps))
 
 
 def deskew(points: Array, times: Array, velocity: Array) -> Array:
@@ -119,15 +121,11 @@ class _Sweep:
     def enough(self) -> bool:
         return len(self.points) >= self.options.min_points
 
-    def at_stamp(self, velocity: Array | None) -> Array:
-        """Its points (n, 3), moved by a velocity (6,) to the stamp."""
-        if velocity is None or self.times is None:
-            return self.points
-        return deskew(self.points, self.times, velocity)
-
     def surface(self, velocity: Array | None) -> Surface:
         """What it saw, its points moved by a velocity (6,) to the stamp."""
-        return registration.surface(self.at_stamp(velocity), self.options.cell)
+        if velocity is None or self.times is None:
+            return registration.surface(self.points, self.options.cell)
+        return registration.surface(deskew(self.points, self.times, velocity), self.options.cell)
 
 
 _Step = tuple[Array, Array] | None
@@ -168,15 +166,13 @@ def _first_pass(stream: Stream, options: VelodyneOptions) -> tuple[list[_Step], 
     return steps, np.array(seen)
 
 
-def _second_pass(stream: Stream, options: VelodyneOptions, first: list[_Step]) -> list[_Step]:
-    """The steps of the first pass once more: each sweep, moved by the mean velocity of the steps around it, on the
-    last ones; or, where there are not enough of those yet, the sweep before on the next ones."""
-    dt = np.diff(stream.stamps)
-    velocity = [None if s is None else se3.vector(s[0]) / t for s, t in zip(first, dt, strict=True)]
+def _again(stream: Stream, options: VelodyneOptions, first: list[_Step]) -> list[_Step]:
+    """The steps once more, sweeps straightened by them: each on the last ones; or, where there are not enough of
+    those yet, the sweep before on the next ones."""
+    velocity = _velocities(stream, first)
 
-    def points(k: int) -> Array:
-        around = [v for v in velocity[max(k - 1, 0) : k + 1] if v is not None]
-        return _Sweep.read(stream, k, options).at_stamp(np.mean(around, axis=0) if around else None)
+    def seen(k: int) -> Surface:
+        return _Sweep.read(stream, k, options).surface(velocity[k])
 
     steps, early = list(first), []
     last: list[Array] = []  # the newest first, all where the scanner was at its stamp
@@ -184,30 +180,39 @@ def _second_pass(stream: Stream, options: VelodyneOptions, first: list[_Step]) -
         if seed is None:
             last = []
             continue
-        last = last or [points(k)]
+        last = last or [seen(k).points]
         if sum(map(len, last)) < LOCAL:
             early.append(k)
-        curr = points(k + 1)
-        steps[k] = step = _on(last, curr, seed[0], options)
-        last = [] if step is None else _enough([curr, *_moved(last, se3.invert(step[0]))])
+        curr = seen(k + 1)
+        steps[k] = step = _step(registration.surface(np.concatenate(last), options.cell), curr, seed[0], options)
+        last = [] if step is None else _enough([curr.points, *_moved(last, se3.invert(step[0]))])
     for k in reversed(early):
         if (step := steps[k]) is not None:
-            later = [points(k + 1)]
-            T = np.eye(4)
+            later, T = [seen(k + 1).points], np.eye(4)
             for i in range(k + 1, len(steps)):
-                if (next_ := steps[i]) is None or sum(map(len, later)) >= LOCAL:
+                if (after := steps[i]) is None or sum(map(len, later)) >= LOCAL:
                     break
-                T = T @ next_[0]
-                later += _moved([points(i + 1)], T)
-            back = _on(later, points(k), se3.invert(step[0]), options) if len(later) > 1 else None
+                T = T @ after[0]
+                later += _moved([seen(i + 1).points], T)
+            ahead = registration.surface(np.concatenate(later), options.cell)
+            back = _step(ahead, seen(k), se3.invert(step[0]), options) if len(later) > 1 else None
             steps[k] = step if back is None else _inverse(*back)
     return steps
 
 
-def _on(clouds: Sequence[Array], curr: Array, T_seed: Array, options: VelodyneOptions) -> _Step:
-    """A sweep (n, 3) laid on clouds that are in one frame."""
-    surface = registration.surface(np.concatenate(clouds), options.cell)
-    return _step(surface, registration.surface(curr, options.cell), T_seed, options)
+def _velocities(stream: Stream, steps: list[_Step]) -> list[Array | None]:
+    """(6,) of ``vec`` per second at each stamp: of the four steps around it, the derivative of the quartic through
+    their ends; of those beside it where some are missing."""
+    each = [None if s is None else se3.vector(s[0]) / t for s, t in zip(steps, np.diff(stream.stamps), strict=True)]
+    found: list[Array | None] = []
+    for k in range(len(stream)):
+        around = each[max(k - 2, 0) : k + 2]
+        known = [v for v in each[max(k - 1, 0) : k + 1] if v is not None]
+        if len(around) == 4 and all(v is not None for v in around):
+            found.append(np.tensordot([-1 / 12, 7 / 12, 7 / 12, -1 / 12], np.array(around), 1))
+        else:
+            found.append(np.mean(known, axis=0) if known else None)
+    return found
 
 
 def _enough(clouds: list[Array]) -> list[Array]:
