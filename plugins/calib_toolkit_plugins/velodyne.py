@@ -20,11 +20,11 @@ LATE = 0.01
 instant at which a sweep shows roll and pitch depends on where there is something to see."""
 ASIDE = 0.2
 """Of the time from the stamp to the middle of what is seen: so far a motion within a tenth of a second is known."""
-LOCAL = 60_000
+LOCAL = 40_000
 """Cells, about, of the last sweeps, on which the next one is laid: with few beams most of the ground lies between
 the rings of a single sweep, and rings that lie on rings hide half of all roll and pitch."""
-COARSER = 2.0
-"""How many times larger the cells of the first pass are."""
+COARSER = 2
+"""How many times larger the cells of the first pass are, and how many times fewer they need be."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class VelodyneOptions:
 
     min_range: float = 2.0
     max_range: float = 100.0
-    cell: float = 0.25
+    cell: float = 0.3
     gate: float = 0.2
     range_sigma: float = 0.1
     max_jump: float = 3.0
@@ -56,26 +56,23 @@ class VelodyneOptions:
 @hookimpl
 def calib_register_sensors() -> list[Sensor]:
     """The ``velodyne`` sensor."""
-    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="7")]
+    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="8")]
 
 
 def estimate(stream: Stream, options: VelodyneOptions) -> Motions:
     """``T_prev_curr`` between the stamps of successive ``Scan`` readings, with the covariance of range noise.
 
-    Three passes. In the first, a coarse one, the previous motion is the first guess and moves the points of a sweep
-    to its stamp, as in the paper; but roll and pitch change within a sweep, so the others move them as fast as the
-    motions before and after say. They lay each sweep on the last few, which those motions bring together; the second
-    is coarse, too. A step that fails (too few points, too little overlap, a jump) is left out.
+    Each sweep is laid on the last few. In the first of two passes, a coarse one, the previous motion is the first
+    guess and moves the points of a sweep to its stamp, as in the paper; but roll and pitch change within a sweep, so
+    the second moves them as fast as the motions before and after say. A step that fails (too few points, too little
+    overlap, a jump) is left out.
     Raises DataError with fewer than two readings, or one that is not a scan.
     """
     if len(stream) < 2:
         raise DataError(f"sensor {stream.name}: a motion takes two scans, and there are {len(stream)}")
     timed = options.deskew and getattr(stream.readings[0], "times", None) is not None
     coarse = replace(options, cell=COARSER * options.cell) if timed else options
-    steps = _checked(stream, coarse, *_first_pass(stream, coarse))
-    if timed:
-        steps = _again(stream, coarse, steps)
-    return _motions(stream, _again(stream, options, steps))
+    return _motions(stream, _again(stream, options, _checked(stream, coarse, *_first_pass(stream, coarse))))
 
 
 def deskew(points: Array, times: Array, velocity: Array) -> Array:
@@ -145,7 +142,8 @@ def _first_pass(stream: Stream, options: VelodyneOptions) -> tuple[list[_Step], 
     And where each scan lies, (n, 4), as :mod:`~calib_toolkit_plugins.world_frame` wants it.
     """
     steps: list[_Step] = []
-    prev, made, velocity = _Sweep.read(stream, 0, options), None, None
+    prev, velocity = _Sweep.read(stream, 0, options), None
+    last: list[Array] = []  # the newest first, all where the scanner was at its stamp
     seen = [prev.seen]
     for k in range(1, len(stream)):
         curr, dt = _Sweep.read(stream, k, options), float(stream.stamps[k] - stream.stamps[k - 1])
@@ -154,12 +152,14 @@ def _first_pass(stream: Stream, options: VelodyneOptions) -> tuple[list[_Step], 
             seed = registration.register(
                 prev.surface(None), curr.surface(None), np.eye(4), registration.FAR_LEVELS, options.gate
             )
-            velocity, made = se3.vector(seed) / dt, None
+            velocity = se3.vector(seed) / dt
         step = None
         if prev.enough and curr.enough and seed is not None:
-            made, before = curr.surface(velocity), made if made is not None else prev.surface(velocity)
-            step = _step(before, made, seed, options)
+            last = last or [prev.surface(velocity).points]
+            made = curr.surface(velocity)
+            step = _step(registration.surface(np.concatenate(last), options.cell), made, seed, options)
         velocity = None if step is None else se3.vector(step[0]) / dt
+        last = [] if step is None else _enough([made.points, *_moved(last, se3.invert(step[0]))], LOCAL // COARSER)
         steps.append(step)
         prev = curr
         seen.append(curr.seen)
@@ -185,7 +185,7 @@ def _again(stream: Stream, options: VelodyneOptions, first: list[_Step]) -> list
             early.append(k)
         curr = seen(k + 1)
         steps[k] = step = _step(registration.surface(np.concatenate(last), options.cell), curr, seed[0], options)
-        last = [] if step is None else _enough([curr.points, *_moved(last, se3.invert(step[0]))])
+        last = [] if step is None else _enough([curr.points, *_moved(last, se3.invert(step[0]))], LOCAL)
     for k in reversed(early):
         if (step := steps[k]) is not None:
             later, T = [seen(k + 1).points], np.eye(4)
@@ -215,10 +215,10 @@ def _velocities(stream: Stream, steps: list[_Step]) -> list[Array | None]:
     return found
 
 
-def _enough(clouds: list[Array]) -> list[Array]:
+def _enough(clouds: list[Array], cells: int) -> list[Array]:
     """The first clouds, as many as make a local map."""
     total = np.cumsum([len(c) for c in clouds])
-    return clouds[: int(np.searchsorted(total, LOCAL)) + 1]
+    return clouds[: int(np.searchsorted(total, cells)) + 1]
 
 
 def _inverse(T: Array, cov: Array) -> tuple[Array, Array]:
