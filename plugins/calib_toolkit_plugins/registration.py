@@ -19,8 +19,8 @@ FAR_LEVELS = (2.0, 1.0, 0.5)
 """Cell sizes, metres, when nothing is known of the motion: found 3 m and several degrees on real scans."""
 NEAR_LEVELS = (0.5,)
 """Cell size, metres, when the motion is foreseen to a few decimetres."""
-NEIGHBOURS = 18
-"""Of each point, for its normal: they reach the next ring on the ground with 32 beams, where 10 find no pitch."""
+NEIGHBOURS = 15
+"""Of each point, for its normal: on the ground they reach the rings of other sweeps."""
 REACH = 0.5
 """Farthest neighbour, metres, whose plane may be a point's."""
 FAINT = 0.012

@@ -20,11 +20,12 @@ LATE = 0.01
 instant at which a sweep shows roll and pitch depends on where there is something to see."""
 ASIDE = 0.2
 """Of the time from the stamp to the middle of what is seen: so far a motion within a tenth of a second is known."""
-LOCAL = 40_000
+LOCAL = 50_000
 """Cells, about, of the last sweeps, on which the next one is laid: with few beams most of the ground lies between
 the rings of a single sweep, and rings that lie on rings hide half of all roll and pitch."""
-COARSER = 2
-"""How many times larger the cells of the first pass are, and how many times fewer they need be."""
+COARSER, COARSE_LOCAL, COARSE_POINTS = 2, 12_000, 30_000
+"""How many times larger the cells of the coarse passes are, how many cells they lay a sweep on, and how many of its
+points they look at, about."""
 
 
 @dataclass(frozen=True)
@@ -56,35 +57,50 @@ class VelodyneOptions:
 @hookimpl
 def calib_register_sensors() -> list[Sensor]:
     """The ``velodyne`` sensor."""
-    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="8")]
+    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="9")]
 
 
 def estimate(stream: Stream, options: VelodyneOptions) -> Motions:
     """``T_prev_curr`` between the stamps of successive ``Scan`` readings, with the covariance of range noise.
 
-    Each sweep is laid on the last few. In the first of two passes, a coarse one, the previous motion is the first
-    guess and moves the points of a sweep to its stamp, as in the paper; but roll and pitch change within a sweep, so
-    the second moves them as fast as the motions before and after say. A step that fails (too few points, too little
-    overlap, a jump) is left out.
+    Each sweep is laid on the last few. In the first pass, a coarse one, the previous motion is the first guess and
+    moves the points of a sweep to its stamp, as in the paper. But roll and pitch change within a sweep, which would
+    hide some hundredths of them: the other two, coarse and fine, move the points as the steps before and after say,
+    acceleration included. A step that fails (too few points, too little overlap, a jump) is left out.
     Raises DataError with fewer than two readings, or one that is not a scan.
     """
     if len(stream) < 2:
         raise DataError(f"sensor {stream.name}: a motion takes two scans, and there are {len(stream)}")
+    fine = _Pass(options, LOCAL)
     timed = options.deskew and getattr(stream.readings[0], "times", None) is not None
-    coarse = replace(options, cell=COARSER * options.cell) if timed else options
-    return _motions(stream, _again(stream, options, _checked(stream, coarse, *_first_pass(stream, coarse))))
+    coarse = _Pass(replace(options, cell=COARSER * options.cell), COARSE_LOCAL, COARSE_POINTS) if timed else fine
+    steps = _checked(stream, options, *_first_pass(stream, coarse))
+    if timed:
+        steps = _again(stream, coarse, steps)
+    return _motions(stream, _again(stream, fine, steps))
 
 
-def deskew(points: Array, times: Array, velocity: Array) -> Array:
+def deskew(points: Array, times: Array, velocity: Array, acceleration: Array | None = None) -> Array:
     """Points, each as measured, moved to where the scanner was at the stamp (paper V-A).
 
-    points: (n, 3) metres. times: (n,) seconds from the stamp. velocity: (6,) of ``vec`` per second. The rotation
-    is taken to second order in the angle turned since the stamp: under a millimetre at 50 m and 20 degrees/s. The
-    path is taken as straight, which in a bend moves all points of a sweep by some millimetres sideways.
+    points: (n, 3) metres. times: (n,) seconds from the stamp. velocity: (6,) of ``vec`` per second at the stamp;
+    acceleration: (6,) its change per second, none by default. The rotation is taken to second order in the time
+    since the stamp: under a millimetre at 50 m and 20 degrees/s. The path is taken as straight, which in a bend
+    moves all points of a sweep by some millimetres sideways.
     """
-    W = se3.skew(velocity[3:])
+    W, (a, alpha) = se3.skew(velocity[3:]), np.zeros((2, 3)) if acceleration is None else acceleration.reshape(2, 3)
     t = times[:, None]
-    return points + t * (points @ W.T + velocity[:3] + (0.5 * t) * (points @ (W @ W).T))
+    return points + t * (points @ W.T + velocity[:3] + (0.5 * t) * (points @ (W @ W + se3.skew(alpha)).T + a))
+
+
+@dataclass(frozen=True)
+class _Pass:
+    """How closely sweeps are looked at. local: cells of the last ones on which the next is laid. points: about as
+    many of each are taken; all by default."""
+
+    options: VelodyneOptions
+    local: int
+    points: int | None = None
 
 
 @dataclass(frozen=True)
@@ -97,8 +113,8 @@ class _Sweep:
     seen: Array
 
     @staticmethod
-    def read(stream: Stream, k: int, options: VelodyneOptions) -> "_Sweep":
-        scan = stream.readings[k]
+    def read(stream: Stream, k: int, how: _Pass) -> "_Sweep":
+        scan, options = stream.readings[k], how.options
         where = f"sensor {stream.name}, scan {k} (stamp {stream.stamps[k]:.6f} s)"
         points = np.asarray(getattr(scan, "points", None), dtype=np.float64)
         times = None if getattr(scan, "times", None) is None else np.asarray(scan.times, dtype=np.float64)
@@ -111,18 +127,20 @@ class _Sweep:
         if times is not None:
             usable &= np.isfinite(times)
             times = times[usable]
-        seen = world_frame.middle_and_nearest(points)
-        return _Sweep(points[usable], times if options.deskew else None, options, seen)
+        seen, points = world_frame.middle_and_nearest(points), points[usable]
+        # an odd step meets all beams of an even number
+        step = len(points) // how.points | 1 if how.points else 1
+        return _Sweep(points[::step], times[::step] if options.deskew and times is not None else None, options, seen)
 
     @property
     def enough(self) -> bool:
         return len(self.points) >= self.options.min_points
 
-    def surface(self, velocity: Array | None) -> Surface:
-        """What it saw, its points moved by a velocity (6,) to the stamp."""
+    def surface(self, velocity: Array | None, acceleration: Array | None = None) -> Surface:
+        """What it saw, its points moved by a velocity (6,) and its change to the stamp."""
         if velocity is None or self.times is None:
             return registration.surface(self.points, self.options.cell)
-        return registration.surface(deskew(self.points, self.times, velocity), self.options.cell)
+        return registration.surface(deskew(self.points, self.times, velocity, acceleration), self.options.cell)
 
 
 _Step = tuple[Array, Array] | None
@@ -136,17 +154,17 @@ def _checked(stream: Stream, options: VelodyneOptions, steps: list[_Step], seen:
     return steps
 
 
-def _first_pass(stream: Stream, options: VelodyneOptions) -> tuple[list[_Step], Array]:
+def _first_pass(stream: Stream, how: _Pass) -> tuple[list[_Step], Array]:
     """Every step from the motion before it; from nothing at the start and after a step that failed.
 
     And where each scan lies, (n, 4), as :mod:`~calib_toolkit_plugins.world_frame` wants it.
     """
-    steps: list[_Step] = []
-    prev, velocity = _Sweep.read(stream, 0, options), None
+    options, steps = how.options, list[_Step]()
+    prev, velocity = _Sweep.read(stream, 0, how), None
     last: list[Array] = []  # the newest first, all where the scanner was at its stamp
     seen = [prev.seen]
     for k in range(1, len(stream)):
-        curr, dt = _Sweep.read(stream, k, options), float(stream.stamps[k] - stream.stamps[k - 1])
+        curr, dt = _Sweep.read(stream, k, how), float(stream.stamps[k] - stream.stamps[k - 1])
         seed = None if velocity is None else se3.matrix(velocity * dt)
         if seed is None and prev.enough and curr.enough:
             seed = registration.register(
@@ -159,20 +177,20 @@ def _first_pass(stream: Stream, options: VelodyneOptions) -> tuple[list[_Step], 
             made = curr.surface(velocity)
             step = _step(registration.surface(np.concatenate(last), options.cell), made, seed, options)
         velocity = None if step is None else se3.vector(step[0]) / dt
-        last = [] if step is None else _enough([made.points, *_moved(last, se3.invert(step[0]))], LOCAL // COARSER)
+        last = [] if step is None else _enough([made.points, *_moved(last, se3.invert(step[0]))], how.local)
         steps.append(step)
         prev = curr
         seen.append(curr.seen)
     return steps, np.array(seen)
 
 
-def _again(stream: Stream, options: VelodyneOptions, first: list[_Step]) -> list[_Step]:
+def _again(stream: Stream, how: _Pass, first: list[_Step]) -> list[_Step]:
     """The steps once more, sweeps straightened by them: each on the last ones; or, where there are not enough of
     those yet, the sweep before on the next ones."""
-    velocity = _velocities(stream, first)
+    options, moving = how.options, _derivatives(stream, first)
 
     def seen(k: int) -> Surface:
-        return _Sweep.read(stream, k, options).surface(velocity[k])
+        return _Sweep.read(stream, k, how).surface(*moving[k])
 
     steps, early = list(first), []
     last: list[Array] = []  # the newest first, all where the scanner was at its stamp
@@ -181,16 +199,16 @@ def _again(stream: Stream, options: VelodyneOptions, first: list[_Step]) -> list
             last = []
             continue
         last = last or [seen(k).points]
-        if sum(map(len, last)) < LOCAL:
+        if sum(map(len, last)) < how.local:
             early.append(k)
         curr = seen(k + 1)
         steps[k] = step = _step(registration.surface(np.concatenate(last), options.cell), curr, seed[0], options)
-        last = [] if step is None else _enough([curr.points, *_moved(last, se3.invert(step[0]))], LOCAL)
+        last = [] if step is None else _enough([curr.points, *_moved(last, se3.invert(step[0]))], how.local)
     for k in reversed(early):
         if (step := steps[k]) is not None:
             later, T = [seen(k + 1).points], np.eye(4)
             for i in range(k + 1, len(steps)):
-                if (after := steps[i]) is None or sum(map(len, later)) >= LOCAL:
+                if (after := steps[i]) is None or sum(map(len, later)) >= how.local:
                     break
                 T = T @ after[0]
                 later += _moved([seen(i + 1).points], T)
@@ -200,18 +218,20 @@ def _again(stream: Stream, options: VelodyneOptions, first: list[_Step]) -> list
     return steps
 
 
-def _velocities(stream: Stream, steps: list[_Step]) -> list[Array | None]:
-    """(6,) of ``vec`` per second at each stamp: of the four steps around it, the derivative of the quartic through
-    their ends; of those beside it where some are missing."""
-    each = [None if s is None else se3.vector(s[0]) / t for s, t in zip(steps, np.diff(stream.stamps), strict=True)]
-    found: list[Array | None] = []
+def _derivatives(stream: Stream, steps: list[_Step]) -> list[tuple[Array | None, Array | None]]:
+    """(6,) of ``vec`` per second at each stamp, and its change per second: of the four steps around it, the
+    derivatives of the quartic through their ends; of those beside it where some are missing."""
+    dt = np.diff(stream.stamps)
+    each = [None if s is None else se3.vector(s[0]) / t for s, t in zip(steps, dt, strict=True)]
+    found: list[tuple[Array | None, Array | None]] = []
     for k in range(len(stream)):
         around = each[max(k - 2, 0) : k + 2]
         known = [v for v in each[max(k - 1, 0) : k + 1] if v is not None]
         if len(around) == 4 and all(v is not None for v in around):
-            found.append(np.tensordot([-1 / 12, 7 / 12, 7 / 12, -1 / 12], np.array(around), 1))
+            first, second = np.tensordot([[-1, 7, 7, -1], [1, -15, 15, -1]], np.array(around), 1) / 12
+            found.append((first, second / dt[k]))
         else:
-            found.append(np.mean(known, axis=0) if known else None)
+            found.append((np.mean(known, axis=0) if known else None, None))
     return found
 
 

@@ -34,16 +34,23 @@ def street(seed: int) -> Array:
 
 
 def sweep(
-    boxes: Array, T_world_mid: Array, step: Array, rng: np.random.Generator, sigma: float, rings: int = BEAMS
+    boxes: Array,
+    T_world_mid: Array,
+    step: Array,
+    rng: np.random.Generator,
+    sigma: float,
+    rings: int = BEAMS,
+    more: float | Array = 0.0,
 ) -> Scan:
-    """One clockwise sweep of a scanner that moves by ``step`` a period; its stamp is the middle."""
+    """One clockwise sweep of a scanner that moves by ``step`` a period, and by ``more`` of it each period; its stamp
+    is the middle."""
     azimuth = -np.pi + (np.arange(COLUMNS) + 0.5) * 2 * np.pi / COLUMNS
     azimuth, elevation = (m.ravel() for m in np.meshgrid(azimuth, np.radians(np.linspace(-24.8, 2, rings))))
     part = -azimuth / (2 * np.pi)
     beams = np.stack(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=1
     )
-    T = T_world_mid @ se3.matrix(part[:, None] * step)
+    T = T_world_mid @ se3.matrix(part[:, None] * step + part[:, None] ** 2 / 2 * more)
     ranges = first_hit(boxes, T[:, :3, 3], np.einsum("nij,nj->ni", T[:, :3, :3], beams))
     hit = ranges < 80.0
     ranges = ranges + sigma * rng.standard_normal(len(ranges))

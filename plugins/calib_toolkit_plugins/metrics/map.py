@@ -38,6 +38,8 @@ MATCHING = np.repeat([1e-3, np.radians(0.01)], 3)
 """Sigma of what matching errs in all scans alike (metres, radians): no number of runs averages it away."""
 TOGETHER = 8.0
 """Seconds within which runs have errors in common: scans, or the path between them."""
+FEWEST = 3.0
+"""Degrees of freedom, at least: with two, a variance has no end."""
 SHARED = 0.1
 """Share of the points of one lidar that must find surfaces of the other."""
 
@@ -49,7 +51,7 @@ class Map:
 
     id = "map"
     options: type = NoOptions
-    version = "3"
+    version = "4"
 
     def accepts(self, kind_a: str, kind_b: str) -> bool:
         """Whether one is a lidar, and the other a lidar or a sensor of poses."""
@@ -193,7 +195,8 @@ def _jackknife(found: Equations, seen: Array, kept: Array) -> Array:
 
     A single turn may tell nearly all of a lever arm; the plain spread of the gradients then promises too much.
     Runs that are near in time err alike (Bartlett's weights; Newey & West, 1987). Along no direction is it taken to
-    be less than if every link erred on its own, which so few runs may feign.
+    be less than if every link erred on its own, which so few runs may feign; and a variance told by few runs is wide
+    itself: the estimate follows Student's t, with 1.5 degrees of freedom for each stretch of runs that err alike.
     """
     without = np.diag(kept) - seen.T @ found.shares @ seen
     slopes = found.slopes - found.slopes.mean(axis=0)
@@ -202,10 +205,11 @@ def _jackknife(found: Equations, seen: Array, kept: Array) -> Array:
     moves = np.einsum("nij,nj->ni", inverse, slopes @ seen) * np.sqrt(kept)
     alike = np.maximum(1 - np.abs(found.when[:, None] - found.when) / TOGETHER, 0.0)
     # the mean was taken out, which hides a part of what all have in common
-    hidden = 1 - alike.sum() / len(moves) ** 2
-    variance, axes = np.linalg.eigh(moves.T @ alike @ moves / max(hidden, LEFT))
+    stretches = len(moves) ** 2 / alike.sum()
+    variance, axes = np.linalg.eigh(moves.T @ alike @ moves / max(1 - 1 / stretches, LEFT))
     axes = seen / np.sqrt(kept) @ axes
-    return np.asarray(axes * np.maximum(variance, 1.0) @ axes.T)
+    freedom = max(1.5 * stretches, FEWEST)
+    return np.asarray(axes * np.maximum(variance, 1.0) @ axes.T) * freedom / (freedom - 2)
 
 
 def _refused(pair: Pair, note: str) -> PairEstimate:
