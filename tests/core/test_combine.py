@@ -22,7 +22,7 @@ from scipy.stats import chi2
 
 from calib_toolkit import se3
 from calib_toolkit.combine import combine, combine_paper
-from calib_toolkit.combine.evidence import evidence
+from calib_toolkit.combine.factors import factor
 from calib_toolkit.types import PairEstimate, Transform
 
 NEVER = chi2.isf(1e-7, 6)
@@ -74,9 +74,9 @@ def test_the_law_holds_to_rounding_where_nothing_is_off():
                 assert at_most(pair.cov, own(e, motion))
             else:
                 distance = np.linalg.norm(pair.T_a_b[:3, 3])
-                across = evidence(e, NAMES).across
+                across = factor(e, NAMES).across
                 told = np.block([[across.T / distance, np.zeros((2, 3))], [np.zeros((3, 3)), np.eye(3)]])
-                assert at_most(told @ pair.cov @ told.T, evidence(e, NAMES).cov)
+                assert at_most(told @ pair.cov @ told.T, factor(e, NAMES).cov)
 
 
 def test_errors_are_what_the_covariance_says_and_less_than_before():

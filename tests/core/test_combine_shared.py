@@ -15,7 +15,7 @@ from combined_rigs import (
 from numpy.testing import assert_allclose
 
 from calib_toolkit.combine import combine, shared
-from calib_toolkit.combine.evidence import evidence
+from calib_toolkit.combine.factors import factor
 
 
 def test_metrics_of_a_pair_count_as_little_more_than_one():
@@ -28,7 +28,7 @@ def test_metrics_of_a_pair_count_as_little_more_than_one():
 
 
 def test_pairs_of_one_sensor_go_together():
-    everything = [evidence(e, NAMES) for e in drawn(np.random.default_rng(1))[2]]
+    everything = [factor(e, NAMES) for e in drawn(np.random.default_rng(1))[2]]
     T = drawn(np.random.default_rng(1))[0]
     cov = shared.covariance(everything, T)
     unit = np.sqrt(np.diag(cov))
