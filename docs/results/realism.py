@@ -167,8 +167,7 @@ class Drive:
         Pixels (m, 2), depths (m,), and which points have something farther right beside them in their ring.
         """
         camera, T_velo_cam = self.log.streams["cam0"], self.truth.between("velo", "cam0").T_a_b
-        stamp, i = camera.stamps[k], self.truth.index("cam0")
-        base = stamp + self.truth.dt_base_sensor[i] + self.truth.clock_skew[i] * (stamp - self.truth.t_ref)
+        base = camera.stamps[k] + self.truth.dt_at("velo", "cam0", camera.stamps[k])
         nearest = int(np.argmin(np.abs(self.log.streams["velo"].stamps - base)))
         T = se3.invert(self.poses(np.array([base])) @ T_velo_cam @ se3.matrix([0, 0, 0, 0, off, 0]))[0]
         seen, zero = self.sweep(nearest)[1] @ T[:3, :3].T + T[:3, 3], np.zeros(3)

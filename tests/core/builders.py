@@ -57,6 +57,14 @@ def known_times(
     return Steps(np.stack([stamps[:-1], stamps[1:]], axis=1), vec, cov, has_scale)
 
 
+def in_axes(steps: Steps, i: int, R: Array) -> Steps:
+    """The same steps with sensor i's axes turned: what it calls v it now calls R v."""
+    both = np.kron(np.eye(2), R)
+    vec, cov = steps.vec.copy(), steps.cov.copy()
+    vec[i], cov[i] = vec[i] @ both.T, both @ cov[i] @ both.T
+    return Steps(steps.ends, vec, cov, steps.has_scale)
+
+
 def in_base(mounts: Sequence[Array]) -> Array:
     """(n, 4, 4) true ``T_base_sensor``; the first is the base."""
     return se3.relative(np.broadcast_to(mounts[0], (len(mounts), 4, 4)), np.array(mounts))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from builders import MOUNTS, in_base, known_times, pose, squared, turn_error
+from builders import MOUNTS, in_axes, in_base, known_times, pose, squared, turn_error
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
@@ -36,14 +36,6 @@ def exact(mounts, sigma=SIGMA):
 
 def mounted(rotvec):
     return [pose(0, 0, 1.7), se3.matrix(np.concatenate([[0.3, -0.2, 1.0], rotvec]))]
-
-
-def in_axes(steps, i, R):
-    """The same steps with sensor i's axes turned: what it calls v it now calls R v."""
-    both = np.kron(np.eye(2), R)
-    vec, cov = steps.vec.copy(), steps.cov.copy()
-    vec[i], cov[i] = vec[i] @ both.T, both @ cov[i] @ both.T
-    return Steps(steps.ends, vec, cov, steps.has_scale)
 
 
 @pytest.mark.parametrize("rotvec", TURNS.values(), ids=TURNS)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from builders import CAMERA, INS, LIDAR, MOUNTS, exact_turns, in_base, known_times, pose, squared
+from builders import CAMERA, INS, LIDAR, MOUNTS, exact_turns, in_axes, in_base, known_times, pose, squared
 from numpy.testing import assert_allclose
 
 from calib_toolkit import delta, rotation, se3, translation
@@ -180,14 +180,6 @@ def test_pairs_of_cameras_are_skipped_and_all_others_come_in_both_orders():
     found = {(m.x, m.y, m.turned_by) for m in translation.likelihood_terms(positions(MOUNTS[:4]), motion)}
     pairs = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3)]
     assert found == {(x, y, k) for x, y in pairs for k in (x, y)}
-
-
-def in_axes(steps, i, R):
-    """The same steps with sensor i's axes turned: what it calls v it now calls R v."""
-    both = np.kron(np.eye(2), R)
-    vec, cov = steps.vec.copy(), steps.cov.copy()
-    vec[i], cov[i] = vec[i] @ both.T, both @ cov[i] @ both.T
-    return Steps(steps.ends, vec, cov, steps.has_scale)
 
 
 def both_stages(steps, trim=0.25):

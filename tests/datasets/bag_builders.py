@@ -1,10 +1,20 @@
-"""Bags made by hand: one message of each type, and small drives of them."""
+"""Bags made by hand: one message of each type, and a small drive of them in every storage."""
 
 import numpy as np
 
+from calib_toolkit import ReadContext
+from calib_toolkit_datasets.bags import log as bags
 from calib_toolkit_datasets.bags.messages import encode, types
 
-START = 1_700_000_000 * 10**9
+START, STEP = 1_700_000_000 * 10**9, 100_000_000
+STORAGES = ["rosbag1", "sqlite", "mcap"]
+PACKED = [
+    *((s, None) for s in STORAGES),
+    ("rosbag1", "bz2"),
+    ("rosbag1", "lz4"),
+    ("sqlite", "zstd"),
+    ("mcap", "zstd"),
+]
 
 
 class Messages:
@@ -127,3 +137,39 @@ def points(rng, n=50, **columns):
     for name, values in columns.items():
         table[name] = values
     return table
+
+
+def drive(encoding, n=8, size=40):
+    """Messages of n sweeps of so many points, and of a camera, an INS and an odometry beside them."""
+    m, rows, rng = Messages(encoding), [], np.random.default_rng(4)
+    K = np.array([[60.0, 0, 8], [0, 60, 6], [0, 0, 1]])
+    rows.append(("/tf_static", START, m.frames(m.transform("velo", "cam0", (1, 0, 0)))))
+    for k in range(n):
+        ns = START + k * STEP
+        pixels = rng.integers(0, 255, (12, 16, 3)).astype(np.uint8)
+        rows += [
+            ("/velo/points", ns, m.cloud(ns, points(rng, size, time=np.linspace(0, 0.09, size, dtype="f4")))),
+            ("/cam0/image_raw", ns + 7, m.image(ns + 7, pixels, "bgr8")),
+            ("/cam0/camera_info", ns + 7, m.info(ns + 7, K, size=(16, 12))),
+            ("/ins/fix", ns, m.fix(ns, 49 + 1e-5 * k, 8.4, 100.0)),
+            ("/ins/imu", ns, m.imu(ns, (0, 0, 0.1, np.sqrt(0.99)))),
+            ("/odom", ns, m.pose(ns, (k, 0, 0))),
+        ]
+    return rows
+
+
+def made(path, storage, compression=None, n=8, size=40):
+    """A bag of a drive."""
+    return write(path, storage, drive("ros1" if storage == "rosbag1" else "cdr", n, size), compression)
+
+
+def plain(folder):
+    """The file in a ROS 2 bag's folder."""
+    (file,) = [f for f in folder.iterdir() if f.suffix in (".db3", ".mcap")]
+    return file
+
+
+def opened(path):
+    """What is read of a bag, a ROS 1 bag if it is a file."""
+    opens = bags.open_bag1 if path.is_file() else bags.open_bag2
+    return opens(path, ReadContext({}, lambda _: None))

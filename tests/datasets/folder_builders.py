@@ -7,12 +7,24 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib_toolkit import DataError, open_log, se3
+from calib_toolkit import DataError, Log, open_log, se3
+from calib_toolkit.plugins import registry
 
+PLUGINS = registry()
 START = 1_403_636_579_763_555_584
 STEP = 100_000_000
 TR = np.array([[0.0, -1, 0, 0.01], [0, 0, -1, -0.06], [1, 0, 0, -0.33]])
 P = [np.array([[700.0, 0, 600, -700.0 * b], [0, 700, 180, 0], [0, 0, 1, 0]]) for b in (0, 0.54, -0.06, 0.48)]
+
+
+def opened(path: Path) -> Log:
+    """A recording, by whichever reader knows it."""
+    return open_log(path, plugins=PLUGINS)
+
+
+def said(log: Log) -> str:
+    """Every note of a log and of its streams, one a line."""
+    return "\n".join([*log.notes, *(n for s in log.streams.values() for n in s.notes)])
 
 
 def drive(n: int) -> np.ndarray:

@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calib_toolkit import DataError, open_log
-from calib_toolkit.plugins import registry
+from calib_toolkit import DataError
 
 START_NS = 315_966_265_259_836_000
 CAMERAS = {"ring_front_center": (12, 16), "stereo_front_left": (16, 12)}  # width, height
@@ -63,16 +62,6 @@ def made(root, lidar=True):
     if lidar:
         feather(root / f"sensors/lidar/{START_NS}.feather", {"x": [1.0], "offset_ns": [0]})
     return root
-
-
-@pytest.fixture(scope="module")
-def plugins():
-    return registry()
-
-
-@pytest.fixture
-def opened(plugins):
-    return lambda path: open_log(path, plugins=plugins)
 
 
 def test_a_log_is_its_cameras_and_the_vehicles_poses(tmp_path, opened):

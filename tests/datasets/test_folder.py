@@ -6,21 +6,12 @@ from pathlib import Path
 import folder_builders as build
 import numpy as np
 import pytest
+from folder_builders import PLUGINS, opened, said
 
-from calib_toolkit import DataError, open_log
-from calib_toolkit.plugins import registry
+from calib_toolkit import DataError
 from calib_toolkit_datasets import cloud_files, name_stamps
 
-PLUGINS = registry()
 pytest.importorskip("laspy", reason="the extra 'las' is not installed")
-
-
-def opened(path):
-    return open_log(path, plugins=PLUGINS)
-
-
-def said(log):
-    return "\n".join([*log.notes, *(n for s in log.streams.values() for n in s.notes)])
 
 
 @pytest.fixture(scope="module")

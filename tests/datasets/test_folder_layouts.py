@@ -6,21 +6,11 @@ import folder_builders as build
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from folder_builders import PLUGINS, opened, said
 
-from calib_toolkit import DataError, open_log, se3
+from calib_toolkit import DataError, se3
 from calib_toolkit.cli import main
-from calib_toolkit.plugins import registry
 from calib_toolkit.types import MotionReading
-
-PLUGINS = registry()
-
-
-def opened(path):
-    return open_log(path, plugins=PLUGINS)
-
-
-def said(log):
-    return "\n".join([*log.notes, *(n for s in log.streams.values() for n in s.notes)])
 
 
 def test_a_kitti_sequence(tmp_path):

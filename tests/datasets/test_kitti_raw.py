@@ -1,22 +1,15 @@
 """KITTI raw drives: what belongs together, what is dropped and said, what is refused."""
 
 import pickle
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from kitti_raw_drives import START_NS, STEP_NS, DriveWriter, opened
 
-from calib_toolkit import Log, ReadContext
+from calib_toolkit import Log
 from calib_toolkit.errors import DataError
 from calib_toolkit_datasets import kitti_raw
-
-START_NS, STEP_NS = 1_317_042_145_594_360_375, 103_617_011
-DriveWriter = Callable[..., Path]
-
-
-def opened(path: Path) -> Log:
-    return kitti_raw.open_log(path, ReadContext({}, lambda p: pytest.fail(f"opened {p}")))
 
 
 def edit_line(file: Path, line: int, text: str) -> None:

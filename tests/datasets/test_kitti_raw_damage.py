@@ -1,20 +1,12 @@
 """Damaged files of a KITTI raw drive: each refused by name when it is read, not when the drive is opened."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from kitti_raw_drives import DriveWriter, opened
 
-from calib_toolkit import Log, ReadContext
 from calib_toolkit.errors import DataError
-from calib_toolkit_datasets import kitti_raw
-
-DriveWriter = Callable[..., Path]
-
-
-def opened(path: Path) -> Log:
-    return kitti_raw.open_log(path, ReadContext({}, lambda p: pytest.fail(f"opened {p}")))
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from calib_toolkit import DataError, Fix, LazyReadings, Log, Scan, Stream, open_log, se3
-from calib_toolkit.plugins import registry
 from calib_toolkit.progress import Silent
 from calib_toolkit.types import Calibration, CameraIntrinsics, MotionReading, PoseReading
 from calib_toolkit_datasets.nuscenes import ego
@@ -62,11 +61,6 @@ def drive(vehicle="ins"):
         determined=np.ones((2, 7), dtype=bool),
     )
     return Log(Path("here"), streams, START_NS // 1000 * 1000, reference)
-
-
-@pytest.fixture(scope="module")
-def plugins():
-    return registry()
 
 
 def rows(path, name):

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from kitti_raw_drives import DriveWriter
 
 from calib_toolkit import DataError, Log, Motions, ReadContext, Sensor, SensorTable, Stream
 from calib_toolkit_datasets import kitti_raw, rig
 
-DriveWriter = Callable[..., Path]
 EPOCH_NS = 1_317_646_534_414_198_001
 
 

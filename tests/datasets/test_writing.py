@@ -7,6 +7,7 @@ from pathlib import Path
 import folder_builders as build
 import numpy as np
 import pytest
+from folder_builders import PLUGINS, opened
 from scipy.spatial.transform import Rotation
 
 from calib_toolkit import (
@@ -19,15 +20,12 @@ from calib_toolkit import (
     PoseReading,
     Scan,
     Stream,
-    open_log,
     se3,
 )
-from calib_toolkit.plugins import registry
 from calib_toolkit.progress import Silent
 from calib_toolkit_datasets import journal, kitti_writing, rig_writing, trajectory_writing
 from calib_toolkit_datasets.bags.frames import reference
 
-PLUGINS = registry()
 N = 14
 LENS = CameraIntrinsics(
     np.array([[50.0, 0, 32.25], [0, 50.5, 24], [0, 0, 1]]),
@@ -35,10 +33,6 @@ LENS = CameraIntrinsics(
     (64, 48),
     np.tile(np.array([0, 255], np.uint8), (48, 32)),
 )
-
-
-def opened(path):
-    return open_log(path, plugins=PLUGINS)
 
 
 def spread(rng):

@@ -1,5 +1,10 @@
 """Small simulated recordings, as the text of their simulated.toml, and the command that calibrates one."""
 
+import os
+import subprocess
+import sys
+import time
+
 import numpy as np
 from click.testing import CliRunner
 
@@ -31,6 +36,23 @@ def run(drive, out, *arguments, jobs=1):
     done = CliRunner().invoke(cli.main, [str(a) for a in command])
     file = out / "calibration.json"
     return done.exit_code, done.output, file.read_text() if file.exists() else ""
+
+
+def killed_when(ready, *arguments, **environment):
+    """``calib-toolkit`` in a process of its own, killed at the first moment that ready() holds, within a minute."""
+    command = [sys.executable, "-c", "from calib_toolkit.cli import main; main()", *map(str, arguments)]
+    process = subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env={**os.environ, **environment}
+    )
+    try:
+        deadline = time.monotonic() + 60
+        while not ready():
+            assert process.poll() is None, "it ended before it could be killed"
+            assert time.monotonic() < deadline, "it never came so far"
+            time.sleep(0.01)
+    finally:
+        process.kill()
+        process.wait()
 
 
 def as_array(rows):

@@ -1,15 +1,11 @@
 """``calib-toolkit convert`` and ``inspect`` of what it wrote; the same calibration from every format."""
 
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from small_runs import killed_when
 
 from calib_toolkit import Config, calibrate, open_log
 from calib_toolkit.cli import main
@@ -81,13 +77,8 @@ def test_a_killed_conversion_leaves_nothing_that_looks_whole(rig, tmp_path):
         "@hookimpl\ndef calib_register_datasets():\n"
         "    return [Dataset('slow', 'nothing', lambda p: False, None, write)]\n"
     )
-    command = [Path(sys.executable).with_name("calib-toolkit"), "convert", rig, tmp_path / "x", "--to", "slow"]
-    process = subprocess.Popen([*command, "--plugin", slow], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while not (tmp_path / ".x.part/x").exists():
-        assert process.poll() is None
-        time.sleep(0.05)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    command = ["convert", rig, tmp_path / "x", "--to", "slow", "--plugin", slow]
+    killed_when((tmp_path / ".x.part/x").exists, *command)
     assert not (tmp_path / "x").exists()
     done = call("convert", rig, tmp_path / "x", "--to", "rosbag2")
     assert done.exit_code == 0
@@ -113,14 +104,8 @@ def slow_drive(tmp_path, seconds):
 def test_a_killed_conversion_to_a_folder_goes_on(tmp_path):
     plugin = slow_drive(tmp_path, 0.1)
     command = ["convert", tmp_path / "a.sleepy", tmp_path / "x", "--to", "rig", "--plugin", plugin]
-    program = Path(sys.executable).with_name("calib-toolkit")
-    process = subprocess.Popen([program, *command], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     scans = tmp_path / ".x.part/x/velo/scans"
-    while not (scans / "000002.npy").exists():
-        assert process.poll() is None
-        time.sleep(0.05)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    killed_when((scans / "000002.npy").exists, *command)
     assert not (tmp_path / "x").exists()
     first = (scans / "000001.npy").stat().st_mtime_ns
     slow_drive(tmp_path, 0.0)

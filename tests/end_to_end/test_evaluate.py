@@ -1,16 +1,12 @@
 """``calib-toolkit evaluate``: what it writes, and what a kill leaves."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
 from evaluated import evaluate, refused, rows_of, simulated
 from scipy.spatial.transform import Rotation
+from small_runs import killed_when
 
 from calib_toolkit import se3
 from calib_toolkit.config import METHODS
@@ -175,15 +171,12 @@ def test_a_kill_loses_only_what_was_running(drive, tmp_path):
     whole = (tmp_path / "whole" / "pair.csv").read_bytes()
 
     out = tmp_path / "killed"
-    code = "from calib_toolkit.cli import main; main()"
-    command = [sys.executable, "-c", code, "evaluate", *map(str, arguments), "-o", str(out)]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"})
     table = out / "pair.csv"
-    deadline = time.monotonic() + 60
-    while not (table.exists() and table.read_bytes().count(b"\n") >= 5) and time.monotonic() < deadline:
-        time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+
+    def begun():
+        return table.exists() and table.read_bytes().count(b"\n") >= 5
+
+    killed_when(begun, "evaluate", *arguments, "-o", out, OMP_NUM_THREADS="1")
     left = table.read_bytes()
     assert 5 <= left.count(b"\n") < 19, "killed too late to tell"
     evaluate(*arguments, "-o", out)

@@ -1,16 +1,12 @@
 """Work is done once: cached by content, resumed after a kill, and the same whatever the number of processes."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from collections import Counter
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from small_runs import killed_when
 
 from calib_toolkit import cli, se3
 from calib_toolkit_datasets import simulated
@@ -137,15 +133,7 @@ def test_the_result_does_not_depend_on_the_slices_being_stored(case, monkeypatch
 def test_a_kill_half_way_costs_the_slice_at_hand(case):
     slowly = case.counter.with_suffix(".slowly")
     slowly.touch()
-    code = "from calib_toolkit.cli import main; main()"
-    running = subprocess.Popen([sys.executable, "-c", code, *case.arguments()], stderr=subprocess.DEVNULL)
-    try:
-        deadline = time.monotonic() + 60
-        while len(case.stored()) < 5 and time.monotonic() < deadline and running.poll() is None:
-            time.sleep(0.02)
-    finally:
-        os.kill(running.pid, signal.SIGKILL)
-        running.wait()
+    killed_when(lambda: len(case.stored()) >= 5, *case.arguments())
     kept = len(case.stored())
     assert 5 <= kept < 2 * SLICES
     assert not (case.folder / "out/calibration.json").exists()

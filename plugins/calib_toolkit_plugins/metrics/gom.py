@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_toolkit import Scan, hookimpl
+from calib_toolkit_plugins.metrics.images import Image
 from calib_toolkit_plugins.metrics.points import evened, intensity_gradients, may_be_hidden
-from calib_toolkit_plugins.metrics.views import Array, Image, Index, LidarCamera, Moment, blurred
+from calib_toolkit_plugins.metrics.views import Array, Index, LidarCamera, Moment, blurred
 
 STRONG = 0.5
 """Share of the points, those with the strongest gradient of intensity, that are compared."""

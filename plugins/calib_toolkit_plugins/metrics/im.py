@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from calib_toolkit import Pair, Scan, hookimpl
 from calib_toolkit.errors import ConfigError
+from calib_toolkit_plugins.metrics.images import Image
 from calib_toolkit_plugins.metrics.points import may_be_hidden
-from calib_toolkit_plugins.metrics.views import Array, Image, Index, LidarCamera, Moment, average, blurred
+from calib_toolkit_plugins.metrics.views import Array, Index, LidarCamera, Moment, average, blurred
 
 FORMS = ("contrast", "squared", "absolute")
 FAINT = 0.3

@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_toolkit import Scan, hookimpl
+from calib_toolkit_plugins.metrics.images import Image
 from calib_toolkit_plugins.metrics.points import steps_behind
-from calib_toolkit_plugins.metrics.views import Array, Image, Index, LidarCamera, Moment, average
+from calib_toolkit_plugins.metrics.views import Array, Index, LidarCamera, Moment, average
 
 STEP = 0.3
 """Metres that what lies beside a point is farther behind, at least."""

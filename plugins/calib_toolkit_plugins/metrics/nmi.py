@@ -9,8 +9,9 @@ from scipy.stats import rankdata
 
 from calib_toolkit import Pair, Scan, hookimpl
 from calib_toolkit.errors import ConfigError
+from calib_toolkit_plugins.metrics.images import Image
 from calib_toolkit_plugins.metrics.points import may_be_hidden
-from calib_toolkit_plugins.metrics.views import Array, Image, Index, LidarCamera, Moment, blurred
+from calib_toolkit_plugins.metrics.views import Array, Index, LidarCamera, Moment, blurred
 
 LEVELS = 1024
 """Of brightness, told apart before it is equalised."""

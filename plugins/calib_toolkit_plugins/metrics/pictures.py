@@ -9,8 +9,9 @@ from scipy.spatial import cKDTree
 
 from calib_toolkit import Pair, se3
 from calib_toolkit.errors import DataError
+from calib_toolkit_plugins.metrics.images import grey_images
 from calib_toolkit_plugins.metrics.points import steps_behind
-from calib_toolkit_plugins.metrics.views import LATEST, Array, Index, Moment, ahead, moved, undistorted, usable_points
+from calib_toolkit_plugins.metrics.views import LATEST, Array, Index, Moment, ahead, moved, usable_points
 
 Part = tuple[int, int, int, int]  # left, top, width and height, pixels
 
@@ -59,8 +60,8 @@ def laid(pair: Pair, row: int) -> Moment | None:
     if abs(at - pair.a.stamps[i]) > LATEST:
         return None
     scan = usable_points(pair.a, i)
-    images, usable, K = undistorted(pair.b, [k])
-    near = ahead(scan, pair.prior, K, images[0].shape)
+    grey, straight = grey_images(pair.b, [k])
+    near = ahead(scan, pair.prior, straight.K, grey[0].shape)
     if len(near) < FEWEST:
         return None
     points = moved(scan, near, pair, i, at)
@@ -72,7 +73,7 @@ def laid(pair: Pair, row: int) -> Moment | None:
     if scan.intensity is not None:
         facts["intensity"] = scan.intensity[near].astype(np.float64)
     known = np.all(np.isfinite(points), axis=1)
-    found = Moment(points[None], facts, images, usable, K, np.zeros((len(points), 2), np.float32))[known]
+    found = Moment(points[None], facts, grey, straight, np.zeros((len(points), 2), np.float32))[known]
     return found if known.any() else None
 
 

@@ -5,7 +5,7 @@ the lidar was when each image was taken (paper, section VII-A); images are freed
 """
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from calib_toolkit import CostMetric, Pair, Scan, Stream, Transform, poses_at, se3
 from calib_toolkit.errors import DataError
+from calib_toolkit_plugins.metrics.images import Image, Straightener, grey_images
 
 Array = NDArray[np.float64]
-Image = NDArray[np.float32]
 Index = NDArray[np.int64]
 
 CAMERAS = ("monocular", "ladybug")
@@ -47,23 +47,37 @@ class Moment:
     """One scan and the images it is compared with, in pixels of the undistorted camera.
 
     points: (j, n, 3) metres, lidar frame at each image's instant. facts: what the lidar tells of each, (n, ...).
-    images: (j) of (h, w), 0 to 1. usable: (h, w) where an image may be used. K: (3, 3).
+    grey: (j) of (h, w), as they were taken. straight: frees them of distortion.
     elsewhere: (n, 2) pixels. pictures: what the metric reads at the points, (j) of (c) images.
     """
 
     points: Array
     facts: dict[str, Array]
-    images: tuple[Image, ...]
-    usable: NDArray[np.bool_]
-    K: Array
+    grey: tuple[NDArray[Any], ...]
+    straight: Straightener
     elsewhere: NDArray[np.float32]
     pictures: tuple[tuple[Image, ...], ...] = ()
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height, pixels."""
-        h, w = self.images[0].shape
+        h, w = self.usable.shape
         return w, h
+
+    @property
+    def images(self) -> tuple[Image, ...]:
+        """(j) of (h, w), 0 to 1; made anew each time."""
+        return tuple(self.straight(image) for image in self.grey)
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """(h, w) where an image may be used."""
+        return self.straight.usable
+
+    @property
+    def K(self) -> Array:
+        """(3, 3)."""
+        return self.straight.K
 
     def __getitem__(self, keep: Any) -> "Moment":
         facts = {name: values[keep] for name, values in self.facts.items()}
@@ -90,7 +104,7 @@ class Moment:
         """
         import cv2
 
-        uv = np.array([self.pixels(T_a_b, j) for j in range(len(self.images))])
+        uv = np.array([self.pixels(T_a_b, j) for j in range(len(self.grey))])
         gone = np.isnan(uv).any(axis=(0, 2))
         spared = SPARED * gone.shape[1] / np.maximum(gone.sum(axis=1, keepdims=True), 1)
         weight = np.where(gone, np.maximum(1 - spared, 0.0), 1.0).astype(np.float32)
@@ -169,9 +183,9 @@ class LidarCamera(CostMetric):
             return None
         scan = usable_points(pair.a, i)
         rng = np.random.default_rng([i, first])
-        images, usable, K = undistorted(pair.b, chosen)
-        inside = np.argwhere(usable)
-        seen = ahead(scan, pair.prior, K, images[0].shape)
+        grey, straight = grey_images(pair.b, chosen)
+        inside = np.argwhere(straight.usable)
+        seen = ahead(scan, pair.prior, straight.K, grey[0].shape)
         if not len(inside) or len(seen) < self.points / 20:
             return None
         seen = np.sort(rng.choice(seen, min(self.candidates, len(seen)), replace=False))
@@ -180,12 +194,12 @@ class LidarCamera(CostMetric):
         if not np.all(np.isfinite(points)):
             return None
         elsewhere = inside[rng.integers(len(inside), size=len(seen))][:, ::-1].astype(np.float32)
-        return Moment(points, facts, images, usable, K, elsewhere)[keep]
+        return Moment(points, facts, grey, straight, elsewhere)[keep]
 
     def focus(self, moment: Moment, around: Transform, blur: float) -> Moment | None:
         """The points that the image shows whatever the pose, as far as the covariance tells, and its pictures."""
         made = replace(moment, pictures=tuple(self.pictures(image, blur) for image in moment.images))
-        uv = np.concatenate([made.pixels(around.T_a_b[None], j) for j in range(len(made.images))])
+        uv = np.concatenate([made.pixels(around.T_a_b[None], j) for j in range(len(made.grey))])
         reach = MARGIN * spread(made, around)
         keep = np.all(np.isfinite(uv), axis=(0, 1)) & within(made.usable, uv, reach)
         made, uv, reach = made[keep], uv[:, :, keep], reach[keep]
@@ -230,27 +244,6 @@ def moved(scan: Scan, chosen: Index, pair: Pair, i: int, at: float) -> Array:
     part = np.clip(np.searchsorted(edges, times, side="right") - 1, 0, INSTANTS - 1)
     T = poses_at(pair.motion_a, stamp + (edges[:-1] + edges[1:]) / 2, at)
     return np.einsum("nij,nj->ni", T[part, :3, :3], points) + T[part, :3, 3]
-
-
-def undistorted(camera: Stream, chosen: Sequence[int]) -> tuple[tuple[Image, ...], NDArray[np.bool_], Array]:
-    """Grey images (h, w) from 0 to 1, where they may be used, and K (3, 3). Raises DataError without intrinsics."""
-    import cv2
-
-    lens = camera.intrinsics
-    if lens is None:
-        raise DataError(f"sensor {camera.name} has no intrinsics; give its camera matrix")
-    grey: list[Image] = []
-    for i in chosen:
-        image = np.asarray(camera.readings[i])
-        image = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
-        grey.append((image / np.float32(255)).astype(np.float32))
-    mask = np.ones(grey[0].shape, np.float32) if lens.mask is None else (lens.mask > 0).astype(np.float32)
-    if not np.any(lens.distortion):
-        return tuple(grey), mask > 0.5, lens.K
-    size = (grey[0].shape[1], grey[0].shape[0])
-    maps = cv2.initUndistortRectifyMap(lens.K, lens.distortion, np.eye(3), lens.K, size, cv2.CV_32FC1)
-    straight = [np.asarray(cv2.remap(g, maps[0], maps[1], cv2.INTER_LINEAR), np.float32) for g in (*grey, mask)]
-    return tuple(straight[:-1]), straight[-1] > 0.99, lens.K
 
 
 def average(values: NDArray[np.float32], weight: NDArray[np.float32]) -> Array:

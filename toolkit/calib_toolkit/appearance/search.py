@@ -167,6 +167,7 @@ def _end(metric: CostMetric, moments: Sequence[Any], frame: Frame, z: Array, see
             return None
         z = _best(cost, z, sigma, rounds, seed)
         value = cost(z[None])[0]
+        del cost  # its pictures, before the next are made
     return value, z
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_toolkit import assembly, observability
-from calib_toolkit.combine.evidence import evidence, labelled, unusable
+from calib_toolkit.combine.factors import factor, labelled, unusable
 from calib_toolkit.combine.solution import Solution
 from calib_toolkit.combine.trust import trusted
 from calib_toolkit.types import Calibration, PairEstimate
@@ -40,7 +40,7 @@ def combine(motion: Calibration, estimates: Sequence[PairEstimate]) -> Combined:
     """
     reasons = [unusable(e, motion.names) for e in estimates]
     usable = [i for i, reason in enumerate(reasons) if not reason]
-    found = trusted(motion, [evidence(estimates[i], motion.names) for i in usable])
+    found = trusted(motion, [factor(estimates[i], motion.names) for i in usable])
     used = np.zeros(len(estimates), dtype=bool)
     used[usable] = found.used
     return Combined(

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from calib_toolkit.combine.evidence import Evidence
+from calib_toolkit.combine.factors import Factor
 
 Array = NDArray[np.float64]
 
@@ -24,21 +24,21 @@ ANYWHERE = 10.0
 """Sigma of numbers that an estimate says nothing of, metres or radians."""
 
 
-def covariance(evidence: Sequence[Evidence], T: Array) -> Array:
+def covariance(factors: Sequence[Factor], T: Array) -> Array:
     """(m, m) of all residuals, one estimate after the other. T: (n, 4, 4) about right.
 
     Every estimate's own block stays what it is. An error of a sensor acts on all its pairs as if it stood elsewhere.
     """
-    cov = np.asarray(block_diag(*(e.cov for e in evidence)))
-    ends = np.cumsum([0, *(len(e.cov) for e in evidence)])
+    cov = np.asarray(block_diag(*(f.cov for f in factors)))
+    ends = np.cumsum([0, *(len(f.cov) for f in factors)])
     common: dict[Hashable, list[tuple[int, Array]]] = {}
-    for k, e in enumerate(evidence):
-        _, by_a, by_b = e.linear(T, np.zeros(len(T)))
-        for source, by_error in ((e.a, by_a), (e.b, by_b), ((e.a, e.b), by_b)):
+    for k, f in enumerate(factors):
+        _, by_a, by_b = f.linear(T, np.zeros(len(T)))
+        for source, by_error in ((f.a, by_a), (f.b, by_b), ((f.a, f.b), by_b)):
             common.setdefault(source, []).append((k, by_error))
     for name, members in common.items():
         share = FRAMES if isinstance(name, tuple) else SENSOR
-        known = reduce(larger, (by_error.T @ np.linalg.inv(evidence[k].cov) @ by_error for k, by_error in members))
+        known = reduce(larger, (by_error.T @ np.linalg.inv(factors[k].cov) @ by_error for k, by_error in members))
         error = share * np.linalg.inv(known + np.eye(6) / ANYWHERE**2)
         for k, by_k in members:
             for j, by_j in members:

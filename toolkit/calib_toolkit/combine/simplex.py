@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from calib_toolkit import likelihood, se3
 from calib_toolkit.combine.combined import Combined, left_out
-from calib_toolkit.combine.evidence import Evidence, evidence, unusable
+from calib_toolkit.combine.factors import Factor, factor, unusable
 from calib_toolkit.combine.solution import linear
 from calib_toolkit.types import Calibration, PairEstimate
 
@@ -23,12 +23,12 @@ def combine_paper(motion: Calibration, estimates: Sequence[PairEstimate]) -> Com
     as independent, so it is too small. Clock offsets, and what is determined, stay as they were.
     """
     reasons = [unusable(e, motion.names) for e in estimates]
-    appearance = [evidence(e, motion.names) for e, why in zip(estimates, reasons, strict=True) if not why]
+    appearance = [factor(e, motion.names) for e, why in zip(estimates, reasons, strict=True) if not why]
     everything = [*_by_motion(motion), *appearance]
     start, base, n = _start(motion, appearance), motion.index(motion.base), len(motion.names)
     others = [i for i in range(n) if i != base]
     rows = (7 * np.array(others)[:, None] + np.arange(6)).ravel()
-    weights = [np.linalg.inv(e.cov) for e in everything]
+    weights = [np.linalg.inv(f.cov) for f in everything]
     late = np.zeros(n)
 
     def moved(change: Array) -> Array:
@@ -39,11 +39,11 @@ def combine_paper(motion: Calibration, estimates: Sequence[PairEstimate]) -> Com
 
     def log_probability(change: Array) -> float:
         T = moved(change)
-        off = (e.residual(T, late) for e in everything)
+        off = (f.residual(T, late) for f in everything)
         return -0.5 * float(sum(r @ w @ r for r, w in zip(off, weights, strict=True)))
 
     def bound(T: Array) -> Array:
-        J = [linear(e, T, late)[1][:, rows] for e in everything]
+        J = [linear(f, T, late)[1][:, rows] for f in everything]
         return np.asarray(np.linalg.inv(sum(j.T @ w @ j for j, w in zip(J, weights, strict=True))))
 
     T = moved(likelihood.maximise(log_probability, np.zeros(len(rows)), bound(start)))
@@ -55,19 +55,19 @@ def combine_paper(motion: Calibration, estimates: Sequence[PairEstimate]) -> Com
     return Combined(found, tuple(not why for why in reasons), left_out(estimates, reasons))
 
 
-def _by_motion(motion: Calibration) -> list[Evidence]:
+def _by_motion(motion: Calibration) -> list[Factor]:
     """The motion result as a transform of every pair."""
     pairs = [(motion.names[i], motion.names[j]) for i, j in likelihood.all_pairs(len(motion.names))]
     transforms = [replace(motion.between(a, b), has_scale=True) for a, b in pairs]
-    return [evidence(PairEstimate("motion", t), motion.names) for t in transforms]
+    return [factor(PairEstimate("motion", t), motion.names) for t in transforms]
 
 
-def _start(motion: Calibration, appearance: Sequence[Evidence]) -> Array:
+def _start(motion: Calibration, appearance: Sequence[Factor]) -> Array:
     """(n, 4, 4) where the first estimate of each sensor against the base puts it, or else motion."""
     T, base = motion.T_base_sensor.copy(), motion.index(motion.base)
-    for e in reversed([e for e in appearance if e.has_scale]):
-        if e.a == base:
-            T[e.b] = e.T_a_b
-        elif e.b == base:
-            T[e.a] = se3.invert(e.T_a_b)
+    for f in reversed([f for f in appearance if f.has_scale]):
+        if f.a == base:
+            T[f.b] = f.T_a_b
+        elif f.b == base:
+            T[f.a] = se3.invert(f.T_a_b)
     return T

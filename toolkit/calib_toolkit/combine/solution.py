@@ -10,7 +10,7 @@ from scipy.linalg import cholesky, solve_triangular
 
 from calib_toolkit import assembly, se3
 from calib_toolkit.combine import shared
-from calib_toolkit.combine.evidence import NOWHERE, Evidence
+from calib_toolkit.combine.factors import NOWHERE, Factor
 from calib_toolkit.types import Calibration
 from calib_toolkit.types.calibration import PARAMETERS
 
@@ -65,12 +65,12 @@ class Prior:
 class Solution:
     """The most likely change (7n,) of the motion result, and its derivatives there.
 
-    evidence: as it was used. whitened: (m, 7n) derivative of the whitened residuals by the poses and offsets.
+    factors: as it was used. whitened: (m, 7n) derivative of the whitened residuals by the poses and offsets.
     """
 
     prior: Prior
     change: Array
-    evidence: Sequence[Evidence]
+    factors: Sequence[Factor]
     whitened: Array
 
     @cached_property
@@ -93,9 +93,9 @@ class Solution:
         """(7n, 7n) covariance, vast along what nothing tells."""
         return self._covariance(np.column_stack([self.prior.root, self.prior.open]))
 
-    def expected(self, e: Evidence) -> tuple[Array, Array]:
+    def expected(self, f: Factor) -> tuple[Array, Array]:
         """An estimate's residual, and the covariance that the error of this rig gives it."""
-        off, J = linear(e, self.T, self.late)
+        off, J = linear(f, self.T, self.late)
         return off, np.asarray(J @ self.covariance @ J.T)
 
     def _covariance(self, root: Array) -> Array:
@@ -105,45 +105,45 @@ class Solution:
         return np.asarray(half @ half.T)
 
 
-def solve(prior: Prior, evidence: Sequence[Evidence]) -> Solution:
+def solve(prior: Prior, factors: Sequence[Factor]) -> Solution:
     """Directions count once the distances that they belong to are known from all the rest."""
-    if all(e.has_scale for e in evidence):
-        return _solve(prior, evidence, np.zeros(len(prior.root)))
-    rest = _solve(prior, [e if e.has_scale else e.turns_only() for e in evidence], np.zeros(len(prior.root)))
-    return _solve(prior, [counted(e, rest) for e in evidence], rest.change)
+    if all(f.has_scale for f in factors):
+        return _solve(prior, factors, np.zeros(len(prior.root)))
+    rest = _solve(prior, [f if f.has_scale else f.turns_only() for f in factors], np.zeros(len(prior.root)))
+    return _solve(prior, [counted(f, rest) for f in factors], rest.change)
 
 
-def counted(e: Evidence, rest: Solution) -> Evidence:
+def counted(f: Factor, rest: Solution) -> Factor:
     """The estimate, without its direction if what is known besides may put the two sensors in one place."""
-    if e.has_scale:
-        return e
+    if f.has_scale:
+        return f
     T = rest.T
     J = np.zeros((6, len(T), 7))
-    J[:, e.a, :6], J[:, e.b, :6] = se3.relative_jacobians(T[e.a], T[e.b])
+    J[:, f.a, :6], J[:, f.b, :6] = se3.relative_jacobians(T[f.a], T[f.b])
     by_all = J.reshape(6, -1)[:3]
-    distance, variance = se3.relative(T[e.a], T[e.b])[:3, 3], np.trace(by_all @ rest.covariance @ by_all.T)
-    return e if distance @ distance > FEWEST**2 * variance + NOWHERE**2 else e.turns_only()
+    distance, variance = se3.relative(T[f.a], T[f.b])[:3, 3], np.trace(by_all @ rest.covariance @ by_all.T)
+    return f if distance @ distance > FEWEST**2 * variance + NOWHERE**2 else f.turns_only()
 
 
-def linear(e: Evidence, T: Array, late: Array) -> tuple[Array, Array]:
+def linear(f: Factor, T: Array, late: Array) -> tuple[Array, Array]:
     """A residual (k,) and its change (k, 7n) with the poses, ``(dt, delta)`` in base axes, and the clock offsets."""
-    J = np.zeros((len(e.cov), len(T), 7))
-    off, J[:, e.a, :6], J[:, e.b, :6] = e.linear(T, late)
-    J[:, e.a, 6], J[:, e.b, 6] = e.by_clock, -e.by_clock
+    J = np.zeros((len(f.cov), len(T), 7))
+    off, J[:, f.a, :6], J[:, f.b, :6] = f.linear(T, late)
+    J[:, f.a, 6], J[:, f.b, 6] = f.by_clock, -f.by_clock
     return off, J.reshape(len(J), -1)
 
 
-def _solve(prior: Prior, evidence: Sequence[Evidence], start: Array) -> Solution:
+def _solve(prior: Prior, factors: Sequence[Factor], start: Array) -> Solution:
     """Gauss-Newton over ``change = root @ z``, of which motion says that z is N(0, 1)."""
-    if not evidence:
+    if not factors:
         return Solution(prior, np.zeros(len(prior.root)), (), np.zeros((0, len(prior.root))))
     root = np.column_stack([prior.root, prior.open])
-    L = cholesky(shared.covariance(evidence, prior.moved(start)), lower=True)
+    L = cholesky(shared.covariance(factors, prior.moved(start)), lower=True)
 
     def whitened(z: Array) -> tuple[Array, Array]:
         change = root @ z
         T, late = prior.moved(change), change[6::7]
-        off, J = zip(*(linear(e, T, late) for e in evidence), strict=True)
+        off, J = zip(*(linear(f, T, late) for f in factors), strict=True)
         both = solve_triangular(L, np.column_stack([np.concatenate(off), np.vstack(J)]), lower=True)
         return np.concatenate([z, both[:, 0]]), both[:, 1:]
 
@@ -159,7 +159,7 @@ def _solve(prior: Prior, evidence: Sequence[Evidence], start: Array) -> Solution
         z, off, by_all = better
         if np.sum((J @ step) ** 2) < SETTLED:
             break
-    return Solution(prior, np.asarray(root @ z), evidence, by_all)
+    return Solution(prior, np.asarray(root @ z), factors, by_all)
 
 
 def _turned(root: Array, change: Array) -> Array:

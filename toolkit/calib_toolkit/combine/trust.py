@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from calib_toolkit.combine.evidence import Evidence
+from calib_toolkit.combine.factors import Factor
 from calib_toolkit.combine.solution import Prior, Solution, counted, solve
 from calib_toolkit.types import Calibration
 
@@ -37,18 +37,18 @@ class Trusted:
     notes: tuple[str, ...]
 
 
-def trusted(motion: Calibration, evidence: Sequence[Evidence]) -> Trusted:
+def trusted(motion: Calibration, factors: Sequence[Factor]) -> Trusted:
     """Leaves out what contradicts the rest, worst first, and solves again each time.
 
     What only contradicted an estimate that was left out after it comes back in the end, the last one first.
     """
-    left, wider, notes = list(evidence), np.ones(len(motion.names)), list[str]()
-    out: list[tuple[Evidence, str]] = []
+    left, wider, notes = list(factors), np.ones(len(motion.names)), list[str]()
+    out: list[tuple[Factor, str]] = []
     while left:
-        squares = [_disagreement(e, solve(Prior.of(motion, wider), _without(left, e))) for e in left]
+        squares = [_disagreement(f, solve(Prior.of(motion, wider), _without(left, f))) for f in left]
         worst = int(np.argmax(squares))
         over = squares[worst] > 1
-        suspects = {s for e in (left[worst : worst + 1] if over else left) for s in (e.a, e.b) if wider[s] == 1}
+        suspects = {s for f in (left[worst : worst + 1] if over else left) for s in (f.a, f.b) if wider[s] == 1}
         ratios = [_birge(motion, wider, s, left) if s in suspects else 1.0 for s in range(len(wider))]
         blamed = int(np.argmax(ratios))
         if ratios[blamed] > 1:
@@ -59,44 +59,44 @@ def trusted(motion: Calibration, evidence: Sequence[Evidence]) -> Trusted:
             )
         elif over:
             why = f"the motion and the other pairs (normalised square {squares[worst]:.1f} times the limit)"
-            e = left.pop(worst)
-            out.append((e, f"{e.label} was left out: it contradicts {why}"))
+            f = left.pop(worst)
+            out.append((f, f"{f.label} was left out: it contradicts {why}"))
         else:
             break
-    for e, note in reversed(out):
-        if _disagreement(e, solve(Prior.of(motion, wider), left)) <= 1:
-            left.append(e)
+    for f, note in reversed(out):
+        if _disagreement(f, solve(Prior.of(motion, wider), left)) <= 1:
+            left.append(f)
         else:
             notes.append(note)
-    kept = {id(e) for e in left}
-    return Trusted(solve(Prior.of(motion, wider), left), tuple(id(e) in kept for e in evidence), tuple(notes))
+    kept = {id(f) for f in left}
+    return Trusted(solve(Prior.of(motion, wider), left), tuple(id(f) in kept for f in factors), tuple(notes))
 
 
-def _without(evidence: Sequence[Evidence], one: Evidence) -> list[Evidence]:
-    return [e for e in evidence if e is not one]
+def _without(factors: Sequence[Factor], one: Factor) -> list[Factor]:
+    return [f for f in factors if f is not one]
 
 
-def _disagreement(e: Evidence, rest: Solution) -> float:
+def _disagreement(f: Factor, rest: Solution) -> float:
     """Normalised square of an estimate's residual under a rig that knows nothing of it, over its limit."""
-    e = counted(e, rest)
-    off, cov = rest.expected(e)
-    return _over_limit(off, cov + e.cov)
+    f = counted(f, rest)
+    off, cov = rest.expected(f)
+    return _over_limit(off, cov + f.cov)
 
 
-def _birge(motion: Calibration, wider: Array, sensor: int, evidence: Sequence[Evidence]) -> float:
+def _birge(motion: Calibration, wider: Array, sensor: int, factors: Sequence[Factor]) -> float:
     """How many times too small a sensor's sigma by motion is, if its estimates agree on that; else one.
 
     They are asked without the motion of this sensor, and again without any, since that of others may be wrong, too.
     """
     others = [i for i, name in enumerate(motion.names) if name != motion.base]
-    touching = [e for e in evidence if sensor in (e.a, e.b)]
+    touching = [f for f in factors if sensor in (f.a, f.b)]
     if sensor not in others or len(touching) < 2:
         return 1.0
     for free in (Prior.of(motion, wider, [sensor]), Prior.of(motion, wider, others)):
-        off, cov = _off_motion(motion, solve(free, evidence), sensor)
+        off, cov = _off_motion(motion, solve(free, factors), sensor)
         if _over_limit(off, cov) > 1 and all(
-            _over_limit(*_off_motion(motion, rest, sensor)) > 1 and _disagreement(e, rest) <= 1
-            for e, rest in ((e, solve(free, _without(evidence, e))) for e in touching)
+            _over_limit(*_off_motion(motion, rest, sensor)) > 1 and _disagreement(f, rest) <= 1
+            for f, rest in ((f, solve(free, _without(factors, f))) for f in touching)
         ):
             return float(np.sqrt(off @ np.linalg.solve(cov, off) / len(off)))
     return 1.0

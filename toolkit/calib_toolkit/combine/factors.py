@@ -1,4 +1,4 @@
-"""One pair's estimate as residuals of the rig: which of its six numbers count, and how they change with the poses."""
+"""One pair's estimate as a factor of the rig: which of its six numbers count, and how they change with the poses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ NOWHERE = 1e-9
 
 
 @dataclass(frozen=True)
-class Evidence:
+class Factor:
     """What one usable estimate says of sensors a and b, rows of the calibration, a before b.
 
     across: (3, j) directions along which its translation counts, in axes of a: three, two (across a unit
@@ -35,7 +35,7 @@ class Evidence:
     by_clock: Array
     has_scale: bool
 
-    def turns_only(self) -> "Evidence":
+    def turns_only(self) -> "Factor":
         """Of which the rotation alone counts."""
         return replace(self, across=np.zeros((3, 0)), cov=self.cov[-3:, -3:], by_clock=self.by_clock[-3:])
 
@@ -97,7 +97,7 @@ def labelled(estimate: PairEstimate) -> str:
     return f"{estimate.metric} of {estimate.transform.a} and {estimate.transform.b}"
 
 
-def evidence(estimate: PairEstimate, names: Sequence[str]) -> Evidence:
+def factor(estimate: PairEstimate, names: Sequence[str]) -> Factor:
     """An estimate that is not :func:`unusable`."""
     t = estimate.transform
     a, b = names.index(t.a), names.index(t.b)
@@ -111,7 +111,7 @@ def evidence(estimate: PairEstimate, names: Sequence[str]) -> Evidence:
         T, across = se3.rigid(T[:3, :3], unit), null_space(unit[None])
     told = np.asarray(block_diag(across, np.eye(3)))
     floor = FLOOR * np.eye(told.shape[1])
-    return Evidence(labelled(estimate), a, b, T, across, told.T @ cov @ told + floor, told.T @ by_clock, t.has_scale)
+    return Factor(labelled(estimate), a, b, T, across, told.T @ cov @ told + floor, told.T @ by_clock, t.has_scale)
 
 
 def _correlation(cov: Array) -> Array:
