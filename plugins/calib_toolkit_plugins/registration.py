@@ -43,6 +43,13 @@ class Surface:
     tree: Any
 
 
+def thinned(points: Array, cell: float) -> Array:
+    """(m, 3) the means of (n, 3) points in each cell of ``cell`` metres."""
+    import small_gicp
+
+    return np.array(small_gicp.voxelgrid_sampling(points, cell).points()[:, :3])
+
+
 def surface(points: Array, cell: float) -> Surface:
     """The surface through (n, 3) points, thinned to the mean of each ``cell`` metres."""
     import small_gicp

@@ -93,7 +93,9 @@ class Map:
             return _refused(pair, "none of the scans compared holds enough points")
         few = _search(first, surfaces, start, GATES)
         start = State(few[0].T, np.zeros((len(problem.links), 6)), few[0].variance)
+        del surfaces  # before the next are made: they are large
         surfaces = _surfaces(problem, sweeps, start.T)
+        sweeps.clear()
         state, found, settled, rms = _search(problem, surfaces, start, GATES[-1:])
         shown = int(found.shares.any(axis=(1, 2)).sum())
         if shown < FIRST_RUNS:

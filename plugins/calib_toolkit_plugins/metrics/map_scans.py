@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from calib_toolkit import DataError, Motions, Stream, poses_at, se3
 from calib_toolkit_plugins import registration
-from calib_toolkit_plugins.registration import Surface
 
 Array = NDArray[np.float64]
 
@@ -73,10 +73,17 @@ class Misfit:
 
 
 @dataclass(frozen=True)
-class Patch(Surface):
-    """A surface with normals of zero where neighbours lie on no plane. inside: (n,) points with some on all sides."""
+class Patch:
+    """What a scan saw, one point a cell, frame of the scan.
 
+    points: (n, 3) metres. normals: (n, 3), zero where neighbours lie on no plane. inside: (n,) points with neighbours
+    on all sides. tree: of the points.
+    """
+
+    points: Array
+    normals: Array
     inside: NDArray[np.bool_]
+    tree: cKDTree
 
 
 def read_sweep(track: Track, k: int) -> Sweep | None:
@@ -109,20 +116,20 @@ def straighten(sweep: Sweep, motion: Motions, T_path_lidar: Array) -> Patch | No
     before, after = (
         np.einsum("nij,nj->ni", T[i, :3, :3], sweep.points.astype(np.float64)) + T[i, :3, 3] for i in (k, k + 1)
     )
-    return _planes(registration.surface((1 - part) * before + part * after, CELL))
+    return _planes(registration.thinned((1 - part) * before + part * after, CELL))
 
 
-def _planes(surface: Surface) -> Patch:
-    """The surface with normals only where neighbours lie on a plane, and not in a line along one ring."""
-    rows, _ = surface.tree.batch_knn_search(surface.points, NEIGHBOURS)
-    around = surface.points[np.minimum(rows, len(surface.points) - 1)]
+def _planes(points: Array) -> Patch:
+    """The points, with normals only where neighbours lie on a plane, and not in a line along one ring."""
+    tree = cKDTree(points)
+    around = points[np.minimum(tree.query(points, NEIGHBOURS)[1], len(points) - 1)]
     centre = around.mean(axis=1)
     offset = around - centre[:, None]
     variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset) / NEIGHBOURS)
     flat = (variance[:, 0] < THICK**2) & (variance[:, 1] > WIDE * variance[:, 2])
-    aside = np.einsum("ni,ni->n", surface.points - centre, surface.points - centre)
+    aside = np.einsum("ni,ni->n", points - centre, points - centre)
     inside = aside < EDGE**2 * variance.sum(axis=1)
-    return Patch(surface.points, axes[:, :, 0] * flat[:, None], surface.cloud, surface.tree, inside)
+    return Patch(points, axes[:, :, 0] * flat[:, None], inside, tree)
 
 
 def misfit(target: Patch, source: Patch, T_target_source: Array, gate: float) -> Misfit | None:
@@ -134,9 +141,9 @@ def misfit(target: Patch, source: Patch, T_target_source: Array, gate: float) ->
     flat = np.flatnonzero(source.normals.any(axis=1))
     flat = flat[:: max(1, len(flat) // MATCHES)]
     points, facing = (v[flat] @ T_target_source[:3, :3].T for v in (source.points, source.normals))
-    rows, squared = target.tree.batch_knn_search(points + T_target_source[:3, 3], 1)
-    planes = np.minimum(rows[:, 0], len(target.points) - 1).astype(np.int64)
-    near = (squared[:, 0] < gate**2) & target.inside[planes]
+    distance, rows = target.tree.query(points + T_target_source[:3, 3], distance_upper_bound=gate)
+    planes = np.minimum(rows, len(target.points) - 1)
+    near = np.isfinite(distance) & target.inside[planes]
     near &= np.abs(np.einsum("ij,ij->i", target.normals[planes], facing)) > ALIKE
     if near.sum() < IN_COMMON:
         return None
@@ -153,5 +160,5 @@ def misfit(target: Patch, source: Patch, T_target_source: Array, gate: float) ->
 def covered(target: Patch, source: Patch, T_target_source: Array, gate: float) -> float:
     """Share of the points of one scan that lie within ``gate`` metres of another's."""
     points = source.points[:: max(1, len(source.points) // MATCHES)]
-    _, squared = target.tree.batch_knn_search(points @ T_target_source[:3, :3].T + T_target_source[:3, 3], 1)
-    return float(np.mean(squared[:, 0] < gate**2))
+    moved = points @ T_target_source[:3, :3].T + T_target_source[:3, 3]
+    return float(np.isfinite(target.tree.query(moved, distance_upper_bound=gate)[0]).mean())
