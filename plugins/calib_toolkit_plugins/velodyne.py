@@ -44,7 +44,7 @@ class VelodyneOptions:
 
     min_range: float = 2.0
     max_range: float = 100.0
-    cell: float = 0.3
+    cell: float = 0.25
     gate: float = 0.2
     range_sigma: float = 0.1
     max_jump: float = 3.0
@@ -57,7 +57,7 @@ class VelodyneOptions:
 @hookimpl
 def calib_register_sensors() -> list[Sensor]:
     """The ``velodyne`` sensor."""
-    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="9")]
+    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="10")]
 
 
 def estimate(stream: Stream, options: VelodyneOptions) -> Motions:
@@ -66,7 +66,7 @@ def estimate(stream: Stream, options: VelodyneOptions) -> Motions:
     Each sweep is laid on the last few. In the first pass, a coarse one, the previous motion is the first guess and
     moves the points of a sweep to its stamp, as in the paper. But roll and pitch change within a sweep, which would
     hide some hundredths of them: the other two, coarse and fine, move the points as the steps before and after say,
-    acceleration included. A step that fails (too few points, too little overlap, a jump) is left out.
+    changes of the turn rate included. A step that fails (too few points, too little overlap, a jump) is left out.
     Raises DataError with fewer than two readings, or one that is not a scan.
     """
     if len(stream) < 2:
@@ -80,17 +80,18 @@ def estimate(stream: Stream, options: VelodyneOptions) -> Motions:
     return _motions(stream, _again(stream, fine, steps))
 
 
-def deskew(points: Array, times: Array, velocity: Array, acceleration: Array | None = None) -> Array:
+def deskew(points: Array, times: Array, velocity: Array, more: Array | None = None) -> Array:
     """Points, each as measured, moved to where the scanner was at the stamp (paper V-A).
 
     points: (n, 3) metres. times: (n,) seconds from the stamp. velocity: (6,) of ``vec`` per second at the stamp;
-    acceleration: (6,) its change per second, none by default. The rotation is taken to second order in the time
-    since the stamp: under a millimetre at 50 m and 20 degrees/s. The path is taken as straight, which in a bend
-    moves all points of a sweep by some millimetres sideways.
+    more: (3,) by which the turn rate changes per second, not by default. The rotation is taken to second order in the
+    time since the stamp: under a millimetre at 50 m and 20 degrees/s. The path is taken as straight and even, which
+    in a bend moves all points of a sweep by some millimetres sideways.
     """
-    W, (a, alpha) = se3.skew(velocity[3:]), np.zeros((2, 3)) if acceleration is None else acceleration.reshape(2, 3)
+    W = se3.skew(velocity[3:])
+    bend = W @ W if more is None else W @ W + se3.skew(more)
     t = times[:, None]
-    return points + t * (points @ W.T + velocity[:3] + (0.5 * t) * (points @ (W @ W + se3.skew(alpha)).T + a))
+    return points + t * (points @ W.T + velocity[:3] + (0.5 * t) * (points @ bend.T))
 
 
 @dataclass(frozen=True)
@@ -136,11 +137,11 @@ class _Sweep:
     def enough(self) -> bool:
         return len(self.points) >= self.options.min_points
 
-    def surface(self, velocity: Array | None, acceleration: Array | None = None) -> Surface:
-        """What it saw, its points moved by a velocity (6,) and its change to the stamp."""
+    def surface(self, velocity: Array | None, more: Array | None = None) -> Surface:
+        """What it saw, its points moved to the stamp by a velocity (6,) and the change of its turn rate (3,)."""
         if velocity is None or self.times is None:
             return registration.surface(self.points, self.options.cell)
-        return registration.surface(deskew(self.points, self.times, velocity, acceleration), self.options.cell)
+        return registration.surface(deskew(self.points, self.times, velocity, more), self.options.cell)
 
 
 _Step = tuple[Array, Array] | None
@@ -219,8 +220,11 @@ def _again(stream: Stream, how: _Pass, first: list[_Step]) -> list[_Step]:
 
 
 def _derivatives(stream: Stream, steps: list[_Step]) -> list[tuple[Array | None, Array | None]]:
-    """(6,) of ``vec`` per second at each stamp, and its change per second: of the four steps around it, the
-    derivatives of the quartic through their ends; of those beside it where some are missing."""
+    """(6,) of ``vec`` per second at each stamp, and by how much its turn rate changes per second (3,): of the four
+    steps around it, the derivatives of the quartic through their ends; of those beside it where some are missing.
+
+    How travel changes is not asked: along a bare street the answer would be noise, which the next pass would add to.
+    """
     dt = np.diff(stream.stamps)
     each = [None if s is None else se3.vector(s[0]) / t for s, t in zip(steps, dt, strict=True)]
     found: list[tuple[Array | None, Array | None]] = []
@@ -229,7 +233,7 @@ def _derivatives(stream: Stream, steps: list[_Step]) -> list[tuple[Array | None,
         known = [v for v in each[max(k - 1, 0) : k + 1] if v is not None]
         if len(around) == 4 and all(v is not None for v in around):
             first, second = np.tensordot([[-1, 7, 7, -1], [1, -15, 15, -1]], np.array(around), 1) / 12
-            found.append((first, second / dt[k]))
+            found.append((first, second[3:] / dt[k]))
         else:
             found.append((np.mean(known, axis=0) if known else None, None))
     return found
