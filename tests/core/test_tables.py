@@ -101,7 +101,7 @@ def test_a_last_row_with_fewer_columns_than_the_one_before_was_cut_short(tmp_pat
 
 
 def test_a_file_whose_only_row_was_cut_short_is_refused(tmp_path: Path) -> None:
-    found = tables.read_rows(written(tmp_path, "stamp x y\n1 2"), 3, 3, titles=True)[1:]
+    found = tables.read_rows(written(tmp_path, "stamp x y\n1 2"), 3, 3)[1:]
     with pytest.raises(
         DataError, match=r"line 2 has fewer columns .*, and nothing else is there; write the file anew"
     ):

@@ -65,7 +65,7 @@ def read_rows(file: Path, fewest: int, most: int, titles: bool = False) -> list[
     """
     kept = [(k, text) for k, line in enumerate(_lines(file), 1) if (text := line.partition("#")[0].strip())]
     rows = [Row(file, k, [w.strip() for w in t.split(",")] if "," in t else t.split()) for k, t in kept]
-    if len(rows) > 1 and len(rows[-1].words) < (columns := len(rows[-2].words)):
+    if len(rows) > 1 + titles and len(rows[-1].words) < (columns := len(rows[-2].words)):
         rows[-1] = rows[-1]._replace(words=[""] * columns, cut=True)
     for row in rows:
         if not fewest <= len(row.words) <= most:
