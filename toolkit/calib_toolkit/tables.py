@@ -99,14 +99,14 @@ def read_stamps(file: Path) -> Nanoseconds:
     return np.array([_stamp(text, "1", f"{file}, line {k}", remedy) for k, text in lines], dtype=np.int64)
 
 
-def whole_rows(rows: Sequence[Row]) -> tuple[Sequence[Row], tuple[str, ...]]:
+def whole_rows(rows: Sequence[Row]) -> tuple[list[Row], tuple[str, ...]]:
     """The rows without a last one that was cut short, and the sentence on it. Raises DataError if none is left."""
     if not rows or not rows[-1].cut:
-        return rows, ()
+        return list(rows), ()
     note = f"{rows[-1].place} has fewer columns than the line before it, as if the file had been cut short; left out"
     if len(rows) == 1:
         raise DataError(f"{note}, and nothing else is there; write the file anew")
-    return rows[:-1], (note,)
+    return list(rows[:-1]), (note,)
 
 
 def unfinished(file: Path) -> tuple[str, ...]:
