@@ -99,7 +99,7 @@ def _titled(table: SensorTable, file: Path) -> Log:
     whole = tables.read_rows(file, 1, COLUMNS["csv"][1])
     rows = whole[1:] if len(whole) > 1 and _title(whole[0].words[0]) == titles[0] else whole
     rows, cut = tables.whole_rows(rows)
-    cut += tables.unfinished(file)
+    cut = cut or tables.unfinished(file)
     for row in rows:
         if len(row.words) != len(titles):
             raise DataError(f"{row.place}: {len(row.words)} columns where {len(titles)} belong; correct or remove it")

@@ -196,8 +196,8 @@ def test_where_a_table_was_cut_short_is_said(tmp_path: Path) -> None:
     )
     assert notes[0] == ()
     assert notes[1] == within
-    assert "fixes.csv, line 5 has fewer columns than the line before it" in notes[6][0]
-    assert notes[6][1:] == within
+    (note,) = notes[6]
+    assert "fixes.csv, line 5 has fewer columns than the line before it" in note
 
 
 def test_a_table_without_angles_is_of_positions_alone(tmp_path: Path) -> None:
