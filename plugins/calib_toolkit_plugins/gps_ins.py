@@ -120,6 +120,7 @@ def open_table(table: SensorTable) -> Log:
     fixes = [
         Fix(v[0], v[1], v[2], v[3], v[4], v[5], p, a) for v, p, a in zip(values.tolist(), position, rpy, strict=True)
     ]
+    notes += () if rows[-1].cut else tables.unfinished(file)
     stream = Stream(table.name, "gps_ins", tables.seconds(ns[keep], epoch_ns), fixes, notes=notes)
     return Log(file, {table.name: stream}, epoch_ns)
 

@@ -50,7 +50,7 @@ def open_cameras(table: SensorTable, kind: str, heads: Mapping[str, Mapping[str,
         gone = len(ns_of) - len(numbers)
         notes = (f"{name}: {gone} of {len(ns_of)} images are missing",) if gone else ()
         streams[name] = Stream(name, kind, stamps, readings, intrinsics, False, clock=table.name, notes=notes)
-    return Log(table.folder, streams, epoch_ns)
+    return Log(table.folder, streams, epoch_ns, notes=tables.unfinished(tables.table_file(table, "times")))
 
 
 def _images(name: str, folder: Path) -> dict[int, Path]:
@@ -101,6 +101,8 @@ def _stamps_by_number(table: SensorTable, numbers: Sequence[int]) -> dict[int, i
 
 def _number_and_stamp(row: tables.Row) -> tuple[int | None, tables.Row]:
     """(image number or None, the row without it) of ``[number] stamp``; the stamp may be a date of two words."""
+    if row.cut:
+        raise DataError(f"{row.place} is cut short; complete it, or remove it and its images")
     text = " ".join(row.words)
     plain = len(row.words) == 1 or tables.DATE.fullmatch(text)
     number, _, stamp = ("", "", text) if plain else text.partition(" ")

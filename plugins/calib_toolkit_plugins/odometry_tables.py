@@ -98,6 +98,8 @@ def _titled(table: SensorTable, file: Path) -> Log:
         )
     whole = tables.read_rows(file, 1, COLUMNS["csv"][1])
     rows = whole[1:] if len(whole) > 1 and _title(whole[0].words[0]) == titles[0] else whole
+    rows, cut = tables.whole_rows(rows)
+    cut = cut or tables.unfinished(file)
     for row in rows:
         if len(row.words) != len(titles):
             raise DataError(f"{row.place}: {len(row.words)} columns where {len(titles)} belong; correct or remove it")
@@ -109,7 +111,7 @@ def _titled(table: SensorTable, file: Path) -> Log:
     cov = _covariances(columns)
     has_scale = table.values.get("has_scale", True)
     if kind == MOTION:
-        return _motions(table.name, rows, ns, values, cov, has_scale)
+        return _motions(table.name, rows, ns, values, cov, has_scale, cut)
     keep, notes = tables.usable_rows(ns, values, rows)
     T = _poses("tum", np.column_stack([np.zeros(len(keep)), values[keep]]), [rows[i] for i in keep])
     told = np.full((len(keep), 6, 6), np.nan) if cov is None else cov[keep]
@@ -120,14 +122,20 @@ def _titled(table: SensorTable, file: Path) -> Log:
         options["motion_sigma"] = tuple(sigma.tolist())
     epoch_ns = int(ns[keep[0]])
     times = tables.seconds(ns[keep], epoch_ns)
-    stream = Stream(table.name, "odometry", times, readings, None, has_scale, options=options, notes=notes)
+    stream = Stream(table.name, "odometry", times, readings, None, has_scale, options=options, notes=cut + notes)
     return Log(file, {table.name: stream}, epoch_ns)
 
 
 def _motions(
-    name: str, rows: Sequence[tables.Row], ns: tables.Nanoseconds, vec: Array, cov: Array | None, has_scale: bool
+    name: str,
+    rows: Sequence[tables.Row],
+    ns: tables.Nanoseconds,
+    vec: Array,
+    cov: Array | None,
+    has_scale: bool,
+    notes: tuple[str, ...],
 ) -> Log:
-    """Motions in a table; a row without numbers is one that failed. None can be left out: the chain would break."""
+    """Motions in a table; a row without numbers is one that failed. None between others may go: the chain breaks."""
     late = np.flatnonzero((ns == tables.BLANK) | np.r_[False, np.diff(ns) <= 0])
     if len(late):
         raise DataError(f"{rows[late[0]].place}: its stamp does not come after the one before it; correct it")
@@ -138,7 +146,7 @@ def _motions(
         MotionReading(vec[k], None if cov is None else cov[k]) if usable[k] else MotionReading(None)
         for k in range(len(rows))
     ]
-    stream = Stream(name, "odometry", tables.seconds(ns, int(ns[0])), readings, None, has_scale)
+    stream = Stream(name, "odometry", tables.seconds(ns, int(ns[0])), readings, None, has_scale, notes=notes)
     return Log(rows[0].file, {name: stream}, int(ns[0]))
 
 

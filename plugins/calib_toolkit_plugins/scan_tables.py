@@ -42,7 +42,7 @@ def open_table(table: SensorTable) -> Log:
     stamps = tables.seconds(ns, int(ns[0]))
     period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     load = partial(_load, rate=TURNS[turns] * period / (2 * np.pi) if turns else None)
-    stream = Stream(table.name, "velodyne", stamps, LazyReadings(load, files))
+    stream = Stream(table.name, "velodyne", stamps, LazyReadings(load, files), notes=tables.unfinished(times))
     return Log(times, {table.name: stream}, int(ns[0]))
 
 

@@ -74,7 +74,7 @@ def test_rows_know_their_lines_whatever_is_between_them(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("1 2\n1\n", r"table\.txt, line 2: 1 columns where 2 to 3 belong"),
+        ("1 2\n1\n1 2\n", r"table\.txt, line 2: 1 columns where 2 to 3 belong"),
         ("1 2\n\n1 2 3 4\n", r"table\.txt, line 3: 4 columns where 2 to 3 belong"),
         ("# nothing\n", r"table\.txt holds no rows; name a file that does"),
         ("stamp speed\n", r"table\.txt holds no rows below its titles"),
@@ -83,6 +83,35 @@ def test_rows_know_their_lines_whatever_is_between_them(tmp_path: Path) -> None:
 def test_rows_that_are_not_as_wanted_are_refused(tmp_path: Path, text: str, sentence: str) -> None:
     with pytest.raises(DataError, match=sentence):
         tables.read_rows(written(tmp_path, text), 2, 3, titles=True)
+
+
+def test_a_last_row_with_fewer_columns_than_the_one_before_was_cut_short(tmp_path: Path) -> None:
+    for text in ("1 2 3\n2 2 3\n3 2", "1 2 3\n2 2 3\n3 -\n", "1 2 3\n2 2 3\n3.0e", "1,2,3\n2,2,3\n3,2"):
+        found = rows(tmp_path, text, 1, 3)
+        assert [row.cut for row in found] == [False, False, True]
+        assert found[2].words == ["", "", ""]
+        keep, notes = tables.usable_rows(tables.to_nanoseconds(found), tables.to_numbers(found, 3), found)
+        assert keep.tolist() == [0, 1]
+        assert notes == (
+            f"{tmp_path / 'table.txt'}, line 3 has fewer columns than the line before it, as if the file had been "
+            "cut short; left out",
+        )
+        assert tables.whole_rows(found) == (found[:2], notes)
+        assert tables.whole_rows(found[:2]) == (found[:2], ())
+
+
+def test_a_file_whose_only_row_was_cut_short_is_refused(tmp_path: Path) -> None:
+    found = tables.read_rows(written(tmp_path, "stamp x y\n1 2"), 3, 3)[1:]
+    with pytest.raises(
+        DataError, match=r"line 2 has fewer columns .*, and nothing else is there; write the file anew"
+    ):
+        tables.whole_rows(found)
+
+
+def test_a_file_that_ends_within_a_line_is_unfinished(tmp_path: Path) -> None:
+    assert tables.unfinished(written(tmp_path, "1 2\n3 4\n")) == ()
+    said = f"{tmp_path / 'table.txt'} ends in the middle of a line, as if cut short; its last number may be wrong"
+    assert tables.unfinished(written(tmp_path, "1 2\n3 4")) == (said,)
 
 
 def test_what_is_no_text_is_refused(tmp_path: Path) -> None:

@@ -23,6 +23,58 @@ def test_what_comes_before_the_end_of_a_file_cut_short_is_read(tmp_path, storage
     assert 0 < len(log.streams["velo"]) < 40
 
 
+@pytest.mark.parametrize(
+    ("storage", "compression", "before", "kind"),
+    [
+        ("mcap", "zstd", b"", 200),  # a private record
+        ("mcap", "zstd", b"", 9),  # an attachment
+        ("mcap", None, b"", 15),  # the end of the data
+        ("mcap", None, b"", 2),  # the footer
+        ("rosbag1", "lz4", b"op=", 9),
+    ],
+)
+def test_chunks_that_pass_for_something_else_are_missed_by_the_count(tmp_path, storage, compression, before, kind):
+    path = made(tmp_path / "a", storage, compression, size=20_000)
+    file = path if path.is_file() else plain(path)
+    raw = bytearray(file.read_bytes())
+    at = second_chunk(raw, storage) + len(before)
+    assert raw[at - len(before) : at + 1] == before + bytes([5 if before else 6])
+    raw[at] = kind
+    (tmp_path / "odd").write_bytes(raw)
+    log = open_log(tmp_path / "odd")
+    left = sum(t.messages for t in log.topics)
+    assert 0 < left < 49
+    assert log.notes == (f"odd counts 49 messages, of which {left} were found; the others are lost",)
+
+
+def second_chunk(raw, storage):
+    """Where the kind of a file's second chunk is written."""
+    if storage == "rosbag1":
+        return raw.index(b"op=\x05", raw.index(b"op=\x05") + 1)
+    at, seen = 8, 0
+    while (seen := seen + (raw[at] == 6)) < 2:
+        at += 9 + struct.unpack_from("<Q", raw, at + 1)[0]
+    return at
+
+
+@pytest.mark.parametrize("storage", ["sqlite", "mcap"])
+def test_messages_that_the_metadata_counts_and_no_file_holds_are_noted(tmp_path, storage):
+    path = made(tmp_path / "a", storage)
+    text = (path / "metadata.yaml").read_text()
+    assert "message_count: 49" in text
+    (path / "metadata.yaml").write_text(text.replace("message_count: 49", "message_count: 51"))
+    log = open_log(path)
+    assert log.notes == ("metadata.yaml counts 51 messages, of which 49 were found; the others are lost",)
+
+
+def test_a_file_that_was_cut_behind_its_messages_says_so(tmp_path):
+    file = plain(made(tmp_path / "a", "mcap"))
+    file.write_bytes(file.read_bytes()[:-20])
+    log = open_log(file)
+    assert len(log.streams["velo"]) == 8
+    assert "in the middle of a record of 20 bytes" in log.notes[0]
+
+
 def test_a_bag_whose_index_was_never_written(tmp_path):
     path = made(tmp_path / "a.bag", "rosbag1")
     raw = bytearray(path.read_bytes())

@@ -249,6 +249,24 @@ def written(tmp_path):
     return tmp_path / "r"
 
 
+@pytest.mark.parametrize(
+    "table", ["top/times.txt", "cam/times.txt", "left/times.txt", "ins/fixes.csv", "slam/poses.csv", "vo/poses.csv"]
+)
+def test_a_table_that_was_cut_anywhere_in_its_last_line_says_so(tmp_path, table):
+    rig_writing.write(whole_log(), tmp_path, Silent())
+    assert opened(tmp_path).notes == ()
+    raw = (tmp_path / table).read_bytes()
+    first = raw.rindex(b"\n", 0, -1) + 2
+    for size in [*range(first, len(raw) - 4, 9), *range(len(raw) - 4, len(raw))]:
+        (tmp_path / table).write_bytes(raw[:size])
+        try:
+            log = opened(tmp_path)
+        except DataError:
+            continue
+        said = " ".join((*log.notes, *(n for s in log.streams.values() for n in s.notes)))
+        assert str(tmp_path / table) in said, raw[:size][-40:]
+
+
 def test_forty_damaged_files_of_a_rig(written):
     assert sum(build.damaged(written, PLUGINS, 40)) == 40
 

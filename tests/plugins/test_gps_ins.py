@@ -176,11 +176,28 @@ def test_rows_that_can_not_be_used_are_left_out_with_a_note(tmp_path: Path) -> N
         "1.15,49,8.4,115,0,0,0",
         "1.3,49,8.4,115,0,0,0",
     ]
-    (tmp_path / "fixes.csv").write_text("\n".join([HEADER, *rows]))
+    (tmp_path / "fixes.csv").write_text("\n".join([HEADER, *rows, ""]))
     found = gps_ins.open_table(SensorTable("ins", tmp_path, {"fixes": "fixes.csv"})).streams["ins"]
     assert found.stamps == pytest.approx([0.0, 0.2, 0.3])
     assert [r.sigma_position for r in found.readings] == [None] * 3
     assert ["line 3" in n or "line 5" in n for n in found.notes] == [True, True]
+
+
+def test_where_a_table_was_cut_short_is_said(tmp_path: Path) -> None:
+    whole = "\n".join([HEADER, *(f"{k},49,8.4,115,0,0,0.25" for k in range(1, 5))]) + "\n"
+    notes = {}
+    for cut in (0, 1, 6):
+        (tmp_path / "fixes.csv").write_text(whole[: len(whole) - cut])
+        found = gps_ins.open_table(SensorTable("ins", tmp_path, {"fixes": "fixes.csv"})).streams["ins"]
+        assert len(found) == (3 if cut == 6 else 4)
+        notes[cut] = found.notes
+    within = (
+        f"{tmp_path / 'fixes.csv'} ends in the middle of a line, as if cut short; its last number may be wrong",
+    )
+    assert notes[0] == ()
+    assert notes[1] == within
+    (note,) = notes[6]
+    assert "fixes.csv, line 5 has fewer columns than the line before it" in note
 
 
 def test_a_table_without_angles_is_of_positions_alone(tmp_path: Path) -> None:
@@ -201,10 +218,10 @@ def test_a_table_without_angles_is_of_positions_alone(tmp_path: Path) -> None:
         ("1,49,8.4,115,0,0,0\n2,49,8.4,115,0,0,0", "its first line must be stamp,lat_deg"),
         (HEADER.replace("lat_deg,lon_deg", "lon_deg,lat_deg") + "\n1,8.4,49,115,0,0,0", "its first line must be"),
         (HEADER, "holds no rows below its titles"),
-        (HEADER + "\n1,49,8.4,115,0,0,0\n2,49,8.4,115,0,0", "line 3: 6 columns where"),
+        (HEADER + "\n1,49,8.4,115,0,0,0\n2,49,8.4,115,0,0\n3,49,8.4,115,0,0,0", "line 3: 6 columns where"),
         (HEADER + "\n1,49,8.4,115,0,0,north", "line 2: could not convert string to float: 'north'"),
     ],
-    ids=["no header", "columns swapped", "empty", "cut short", "words"],
+    ids=["no header", "columns swapped", "empty", "too few columns", "words"],
 )
 def test_a_table_that_is_not_of_fixes_is_refused(tmp_path: Path, text: str, sentence: str) -> None:
     (tmp_path / "fixes.csv").write_text(text)

@@ -225,7 +225,8 @@ def test_a_rig_table_that_is_wrong_is_refused_by_name(tmp_path: Path, change: di
         ("0.1\nhalf past\n0.3\n", "line 2: 'half past' is neither"),
         ("", "holds no rows"),
         ("7 0.1\n8 nan\n9 0.3\n", "line 2 holds no stamp"),
-        ("0.1\n2011-13-26 13:02:25\n0.3\n", "line 2: .* is not a stamp"),
+        ("0.1\n2011-13-26 13:02:25\n2011-11-26 13:02:26\n", "line 2: .* is not a stamp"),
+        ("7 0.1\n8 0.2\n9", "line 3 is cut short; complete it, or remove it and its images"),
         ("7 0.1\n9 0.3\n", "no stamp for image 8"),
     ],
 )

@@ -24,6 +24,40 @@ def test_rows_with_nan_or_a_stamp_that_goes_back_or_repeats_are_left_out_with_a_
     assert "2 of 30 rows have a stamp that goes back or repeats, the first in line 11; left out" in late
 
 
+@pytest.mark.parametrize("style", ["tum", "euroc", "kitti"])
+def test_a_last_row_that_was_cut_short_is_left_out_with_a_note(tmp_path: Path, style: str) -> None:
+    table = written(tmp_path, style, list(poses(30)))
+    text = (tmp_path / "poses.txt").read_text()
+    (tmp_path / "poses.txt").write_text(text[: -len(text.splitlines()[-1]) // 2])
+    stream = opened(tmp_path, table)
+    assert len(stream) == 29
+    (note,) = stream.notes
+    assert "poses.txt, line 32 has fewer columns than the line before it" in note
+
+
+def test_a_table_of_another_program_may_end_without_an_end_of_line(tmp_path: Path) -> None:
+    table = written(tmp_path, "tum", list(poses(30)))
+    (tmp_path / "poses.txt").write_text((tmp_path / "poses.txt").read_text().rstrip())
+    assert opened(tmp_path, table).notes == ()
+
+
+@pytest.mark.parametrize("titles", ["stamp,x,y,z,qx,qy,qz,qw", "stamp,x,y,z,rx,ry,rz"])
+def test_a_table_with_titles_says_where_it_was_cut(tmp_path: Path, titles: str) -> None:
+    values = ",1,0,0,0,0,0,1" if "qw" in titles else ",1,0,0,0,0,1.25e-05"
+    whole = "\n".join([titles, *(f"{k}{values}" for k in range(5))]) + "\n"
+    table = {"poses": "poses.csv", "format": "csv"}
+    (tmp_path / "poses.csv").write_text(whole)
+    assert opened(tmp_path, table).notes == ()
+    (tmp_path / "poses.csv").write_text(whole[:-1])
+    assert len(opened(tmp_path, table)) == 5
+    assert "poses.csv ends in the middle of a line, as if cut short" in opened(tmp_path, table).notes[0]
+    (tmp_path / "poses.csv").write_text(whole[:-10])
+    stream = opened(tmp_path, table)
+    assert len(stream) == 4
+    (note,) = stream.notes
+    assert "poses.csv, line 6 has fewer columns than the line before it" in note
+
+
 def test_one_stamp_that_leaps_ahead_costs_only_itself(tmp_path: Path) -> None:
     table = written(tmp_path, "tum", list(poses(30)))
     lines = (tmp_path / "poses.txt").read_text().splitlines()
@@ -74,7 +108,7 @@ def test_a_table_that_can_not_be_used_is_refused(tmp_path: Path, change: dict[st
     (tmp_path / "image.png").write_bytes(b"\x89PNG\xff\xfe")
     (tmp_path / "empty.txt").write_text("# nothing\n")
     (tmp_path / "short.txt").write_text("1 1 1 1 1 1\n")
-    (tmp_path / "cut.txt").write_text("1" + row + "2 0 0 0 0\n")
+    (tmp_path / "cut.txt").write_text("1" + row + "2 0 0 0 0\n3" + row)
     (tmp_path / "words.txt").write_text("now" + row)
     (tmp_path / "milliseconds.txt").write_text("1317646534939" + row)
     (tmp_path / "one.txt").write_text("1" + row)

@@ -21,6 +21,8 @@ HEAD = 512
 """Bytes of a file that are looked at."""
 TARS = (".tgz", ".tbz2", ".txz", ".tzst", ".tar.gz", ".tar.bz2", ".tar.xz", ".tar.zst")
 PICKLES = (".pkl", ".pickle", ".pkl.gz", ".pkl.bz2", ".pkl.xz", ".pickle.gz")
+PLACES = ("*", "*/*", "*/lidar/*")
+"""Where in a folder pickles are looked for; the last is where PandaSet has them below the folder of its scenes."""
 LOOKED_AT = 1000
 """Entries of a folder among which pickles are looked for; a recording of pickles has them among its first."""
 
@@ -56,10 +58,10 @@ def _head(path: Path) -> bytes:
 
 
 def _pickle(path: Path) -> Path | None:
-    """The path itself, or the first pickle in a folder or one folder below; None if there is none."""
+    """The path itself, or the first pickle in a folder, one folder below or where PandaSet has them; else None."""
     if path.is_file():
         return path if path.name.lower().endswith(PICKLES) else None
-    for pattern in ("*", "*/*"):
+    for pattern in PLACES:
         found = [p for p in islice(path.glob(pattern), LOOKED_AT) if p.name.lower().endswith(PICKLES)]
         if found:
             return min(found)

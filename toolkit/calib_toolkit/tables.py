@@ -4,6 +4,7 @@ import re
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Sequence
 from decimal import Decimal
+from os import SEEK_END
 from os.path import expanduser
 from pathlib import Path
 from typing import NamedTuple
@@ -24,11 +25,12 @@ LATEST = 9 * 10**9  # seconds of unix time (the year 2255); a stamp beyond is in
 
 
 class Row(NamedTuple):
-    """One row of a text table, and where it is."""
+    """One row of a text table, and where it is. cut: it is the last and has too few columns; its words are empty."""
 
     file: Path
     line: int
     words: list[str]
+    cut: bool = False
 
     @property
     def place(self) -> str:
@@ -58,10 +60,13 @@ def table_folder(table: SensorTable, key: str) -> Path:
 def read_rows(file: Path, fewest: int, most: int, titles: bool = False) -> list[Row]:
     """Rows of fewest to most columns parted by commas or blanks, without empty lines and # comments.
 
-    titles: the first row is one of titles, and others must follow. Raises DataError.
+    titles: the first row is one of titles, and others must follow. A last row that has fewer columns than the one
+    before it was cut short, and is marked so. Raises DataError.
     """
     kept = [(k, text) for k, line in enumerate(_lines(file), 1) if (text := line.partition("#")[0].strip())]
     rows = [Row(file, k, [w.strip() for w in t.split(",")] if "," in t else t.split()) for k, t in kept]
+    if len(rows) > 1 + titles and len(rows[-1].words) < (columns := len(rows[-2].words)):
+        rows[-1] = rows[-1]._replace(words=[""] * columns, cut=True)
     for row in rows:
         if not fewest <= len(row.words) <= most:
             wanted = f"{fewest}" if fewest == most else f"{fewest} to {most}"
@@ -94,18 +99,38 @@ def read_stamps(file: Path) -> Nanoseconds:
     return np.array([_stamp(text, "1", f"{file}, line {k}", remedy) for k, text in lines], dtype=np.int64)
 
 
+def whole_rows(rows: Sequence[Row]) -> tuple[list[Row], tuple[str, ...]]:
+    """The rows without a last one that was cut short, and the sentence on it. Raises DataError if none is left."""
+    if not rows or not rows[-1].cut:
+        return list(rows), ()
+    note = f"{rows[-1].place} has fewer columns than the line before it, as if the file had been cut short; left out"
+    if len(rows) == 1:
+        raise DataError(f"{note}, and nothing else is there; write the file anew")
+    return list(rows[:-1]), (note,)
+
+
+def unfinished(file: Path) -> tuple[str, ...]:
+    """A sentence if the last line of a file has no end: what programs write has one, unless it was cut short."""
+    with file.open("rb") as content:
+        content.seek(-1, SEEK_END)
+        ended = content.read() == b"\n"
+    return () if ended else (f"{file} ends in the middle of a line, as if cut short; its last number may be wrong",)
+
+
 def usable_rows(ns: Nanoseconds, numbers: Array, rows: Sequence[Row]) -> tuple[NDArray[np.int64], tuple[str, ...]]:
     """Indices of the rows that are whole and whose stamps increase, and sentences on those left out.
 
     ns: (n,). numbers: (n, m). Raises DataError if fewer than two of the rows are left, or fewer than half.
     """
+    _, cut = whole_rows(rows)
     whole = (ns != BLANK) & np.isfinite(numbers).all(axis=1)
     index = np.flatnonzero(whole)
     rising = increasing(ns[index])
     keep = index[rising]
     late = "have a stamp that goes back or repeats"
-    unusable = {"hold nan or nothing": np.flatnonzero(~whole), late: index[~rising]}
-    notes = tuple(
+    hollow = ~whole & [not row.cut for row in rows]
+    unusable = {"hold nan or nothing": np.flatnonzero(hollow), late: index[~rising]}
+    notes = cut + tuple(
         f"{rows[0].file}: {len(which)} of {len(rows)} rows {what}, the first in line {rows[which[0]].line}; left out"
         for what, which in unusable.items()
         if len(which)

@@ -13,13 +13,18 @@ from calib_toolkit_datasets.bags.index import HEAD, Channel, Damaged, Index, Key
 from calib_toolkit_datasets.bags.packing import message, read, size_of, unpack
 
 MAGIC = b"#ROSBAG V2.0\n"
-MESSAGE, BAG, CHUNK, CONNECTION = 2, 3, 5, 7
+MESSAGE, BAG, INDEX, CHUNK, CONNECTION = 2, 3, 4, 5, 7
+INDEXED = 12
+"""Bytes by which the index of a chunk tells where one message lies."""
 _LENGTH = struct.Struct("<I")
 _TIME = struct.Struct("<II")
 
 
 def scan(path: Path, number: int, index: Index) -> None:
-    """Find every message of a file, which is the recording's file of that number. Raises Damaged at what stops it."""
+    """Find every message of a file, which is the recording's file of that number, and how many its chunks index.
+
+    Raises Damaged at what stops it.
+    """
     size, connections = size_of(path), dict[int, Channel]()
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
@@ -41,6 +46,8 @@ def scan(path: Path, number: int, index: Index) -> None:
                 _one(kind, header, data, (number, 0, start, length), connections, index)
             elif start + length > size:
                 raise Damaged(f"it ends at byte {size}, in the middle of a record of {length} bytes")
+            elif kind == INDEX:
+                index.stated += length // INDEXED
             file.seek(start + length)
 
 

@@ -61,12 +61,12 @@ def open_bag2(path: Path) -> Bag:
     if not (path / METADATA).is_file():
         note = f"{path} has no {METADATA}, as if its recording was killed; its files are read in the order of names"
         return _found(_source(path, present), (note,))
-    files = _listed(path)
+    files, stated = _listed(path)
     missing = [f.name for f in files if not f.is_file()]
     if missing:
         raise DataError(f"{path / METADATA} lists {missing[0]}, which is missing; copy the whole folder")
     notes = [f"{path.name}: {p.name} is not in its {METADATA} and is left out" for p in present if p not in files]
-    return _found(_source(path, files), tuple(notes))
+    return _found(_source(path, files), tuple(notes), stated)
 
 
 def fetch(source: Source, key: Key) -> bytes:
@@ -90,16 +90,26 @@ _SCAN: dict[str, Callable[[Path, int, Index], None]] = {
 }
 
 
-def _found(source: Source, notes: Sequence[str]) -> Bag:
+def _found(source: Source, notes: Sequence[str], stated: int = 0) -> Bag:
+    """All messages. stated: how many the metadata says there are, 0 if it does not."""
     index = Index(notes=list(notes))
     for number, file in enumerate(source.files):
+        before, index.stated = index.found, 0
         try:
             _SCAN[source.storage](file, number, index)
         except Damaged as e:
             index.notes.append(f"{file} is damaged: {e}; only what comes before is used")
         except OSError as e:
             raise DataError(f"{file} can not be read ({e.strerror}); make it readable") from e
+        _compare(index, file.name, index.stated, index.found - before)
+    _compare(index, METADATA, stated, index.found)
     return index.bag(source)
+
+
+def _compare(index: Index, where: str, stated: int, found: int) -> None:
+    """Note messages that are counted and were not found: damage can make a record look like one of no interest."""
+    if stated > found:
+        index.notes.append(f"{where} counts {stated} messages, of which {found} were found; the others are lost")
 
 
 def _source(folder: Path, files: Sequence[Path]) -> Source:
@@ -111,8 +121,8 @@ def _source(folder: Path, files: Sequence[Path]) -> Source:
     return Source(tuple(files), "sqlite")
 
 
-def _listed(folder: Path) -> list[Path]:
-    """Files that a metadata.yaml lists, none outside its folder."""
+def _listed(folder: Path) -> tuple[list[Path], int]:
+    """Files that a metadata.yaml lists, none outside its folder, and how many messages it says they hold."""
     file = folder / METADATA
     try:
         content = _yaml(file)["rosbag2_bagfile_information"]
@@ -127,7 +137,8 @@ def _listed(folder: Path) -> list[Path]:
         raise DataError(f"{file} lists no files; remove it to read those that are there")
     if mode.lower() == "file":
         raise DataError(f"{folder} is compressed file by file; unpack {names[0]} with zstd -d, and remove {METADATA}")
-    return [folder / n for n in names]
+    stated = content.get("message_count")
+    return [folder / n for n in names], stated if isinstance(stated, int) else 0
 
 
 def _yaml(file: Path) -> Any:

@@ -17,6 +17,8 @@ Key = tuple[int, int, int, int]
 
 LARGEST = 2**30
 """Bytes of a message or a chunk that are held in memory; more is a damaged length."""
+COLUMNS = 6
+"""Numbers that are kept of each message: when it was received, its stamp, and a ``Key``."""
 HEAD = 12
 """Bytes of a message in which the stamp of its header lies."""
 STAMPED = frozenset(
@@ -85,12 +87,21 @@ class Bag:
 
 @dataclass
 class Index:
-    """Messages as they are found. clashes: topics that have messages of two types."""
+    """Messages as they are found.
+
+    clashes: topics that have messages of two types. stated: how many messages the file being read says it holds.
+    """
 
     channels: dict[str, Channel] = field(default_factory=dict)
     rows: dict[str, "array[int]"] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     clashes: set[str] = field(default_factory=set)
+    stated: int = 0
+
+    @property
+    def found(self) -> int:
+        """How many messages there are so far."""
+        return sum(map(len, self.rows.values())) // COLUMNS
 
     def add(self, channel: Channel, received: int, head: bytes | memoryview, key: Key) -> None:
         """A message of at least ``HEAD`` first bytes, if it is so long."""
@@ -114,7 +125,7 @@ class Index:
             raise DataError(f"{source.files[0]} holds no topic that could be read{why}; record or copy it again")
         topics = {}
         for name, channel in self.channels.items():
-            rows = np.array(self.rows.get(name, ()), dtype=np.int64).reshape(-1, 6)
+            rows = np.array(self.rows.get(name, ()), dtype=np.int64).reshape(-1, COLUMNS)
             rows = rows[np.argsort(rows[:, 0], kind="stable")]
             if name in self.clashes:
                 channel = Channel(name, "messages of several types", "")

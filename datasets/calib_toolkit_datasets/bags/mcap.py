@@ -12,10 +12,12 @@ from calib_toolkit_datasets.bags.index import HEAD, Channel, Damaged, Index, Key
 from calib_toolkit_datasets.bags.packing import message, read, size_of, unpack
 
 MAGIC = b"\x89MCAP0\r\n"
-FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 2, 3, 4, 5, 6, 15
+SCHEMA, CHANNEL, MESSAGE, CHUNK, STATISTICS = 3, 4, 5, 6, 11
+FOOTER, DATA_END = (2, 20), (15, 4)  # and their lengths
 MESSAGE_HEADER = struct.Struct("<HIQQ")
 _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQI")
+_COUNT = struct.Struct("<Q")
 _DEFINITIONS = {"ros1msg": False, "ros2msg": False, "ros2idl": True, "omgidl": True}
 
 
@@ -44,18 +46,27 @@ class _Declared:
 
 
 def scan(path: Path, number: int, index: Index) -> None:
-    """Find every message of a file, which is the recording's file of that number. Raises Damaged at what stops it."""
+    """Find every message of a file, which is the recording's file of that number, and how many it says there are.
+
+    Raises Damaged at what stops it.
+    """
     size, declared = size_of(path), _Declared()
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise Damaged("it does not begin as an MCAP file does")
-        while True:
+        kind, length, summary = 0, 0, False
+        while (kind, length) != FOOTER:
             at = file.tell()
             kind, length = _RECORD.unpack(read(file, _RECORD.size, size - at))
-            if kind in (DATA_END, FOOTER):
-                return
             start = file.tell()
-            if kind == CHUNK:
+            summary |= (kind, length) == DATA_END
+            if start + length > size:
+                raise Damaged(f"it ends at byte {size}, in the middle of a record of {length} bytes")
+            if kind == STATISTICS and length >= _COUNT.size:
+                index.stated += _COUNT.unpack(read(file, _COUNT.size, size - start))[0]
+            elif summary:
+                pass  # it repeats what was declared
+            elif kind == CHUNK:
                 data = read(file, length, size - start)
                 try:
                     _inside(data, at, start, number, declared, index)
@@ -63,8 +74,6 @@ def scan(path: Path, number: int, index: Index) -> None:
                     index.notes.append(f"{path.name}: from byte {at} on {e}; the rest of that chunk is left out")
             elif kind in (SCHEMA, CHANNEL, MESSAGE):
                 _one(kind, read(file, length, size - start), 0, length, (number, 0, start, length), declared, index)
-            elif start + length > size:
-                raise Damaged(f"it ends at byte {size}, in the middle of a record of {length} bytes")
             file.seek(start + length)
 
 

@@ -88,6 +88,12 @@ def test_a_reader_that_is_named_opens_no_archive_either(refused, tmp_path, reade
     assert "is a zip archive" in refused(tmp_path / "a.zip", "--format", reader)
 
 
+def test_a_stray_pickle_far_below_is_not_taken_for_the_recording(refused, tmp_path):
+    (tmp_path / "a/b/c").mkdir(parents=True)
+    (tmp_path / "a/b/c/cache.pkl").write_bytes(b"")
+    assert "no reader knows" in refused(tmp_path / "a")
+
+
 def test_an_archive_inside_a_recording_is_not_opened(refused, tmp_path):
     (tmp_path / "a").mkdir()
     zipped(tmp_path / "a/velo.zip")
@@ -104,13 +110,16 @@ def test_a_pickle_is_never_opened(refused, tmp_path, name):
     assert not (tmp_path / "sprung").exists()
 
 
-@pytest.mark.parametrize("where", ["", "lidar"])
+@pytest.mark.parametrize("where", ["", "001", "001/lidar"])
 def test_a_folder_of_pickles_as_pandaset_has_them(refused, tmp_path, where):
-    folder = tmp_path / "001" / "lidar"
+    folder = tmp_path / "set" / "001" / "lidar"
     folder.mkdir(parents=True)
     for k in range(3):
         (folder / f"{k:02d}.pkl.gz").write_bytes(gzip.compress(pickle.dumps(Trap(tmp_path / "sprung"))))
     (folder / "timestamps.json").write_text("[0.1, 0.2, 0.3]")
-    path = tmp_path / "001" / where
-    assert f"{path} holds pickles ({'' if where else 'lidar/'}00.pkl.gz)" in refused(path)
+    camera = tmp_path / "set" / "001" / "camera" / "front_camera"
+    camera.mkdir(parents=True)
+    (camera / "poses.json").write_text("[]")
+    path = tmp_path / "set" / where
+    assert f"{path} holds pickles ({folder.relative_to(path) / '00.pkl.gz'})" in refused(path)
     assert not (tmp_path / "sprung").exists()
