@@ -57,7 +57,7 @@ class VelodyneOptions:
 @hookimpl
 def calib_register_sensors() -> list[Sensor]:
     """The ``velodyne`` sensor."""
-    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="10")]
+    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="11")]
 
 
 def estimate(stream: Stream, options: VelodyneOptions) -> Motions:
@@ -168,9 +168,7 @@ def _first_pass(stream: Stream, how: _Pass) -> tuple[list[_Step], Array]:
         curr, dt = _Sweep.read(stream, k, how), float(stream.stamps[k] - stream.stamps[k - 1])
         seed = None if velocity is None else se3.matrix(velocity * dt)
         if seed is None and prev.enough and curr.enough:
-            seed = registration.register(
-                prev.surface(None), curr.surface(None), np.eye(4), registration.FAR_LEVELS, options.gate
-            )
+            seed = _from_nothing(stream, k, options)
             velocity = se3.vector(seed) / dt
         step = None
         if prev.enough and curr.enough and seed is not None:
@@ -183,6 +181,12 @@ def _first_pass(stream: Stream, how: _Pass) -> tuple[list[_Step], Array]:
         prev = curr
         seen.append(curr.seen)
     return steps, np.array(seen)
+
+
+def _from_nothing(stream: Stream, k: int, options: VelodyneOptions) -> Array:
+    """``T_prev_curr`` (4, 4) of the step to sweep k where nothing is foreseen, from all points."""
+    prev, curr = (_Sweep.read(stream, i, _Pass(options, 0)).surface(None) for i in (k - 1, k))
+    return registration.register(prev, curr, np.eye(4), registration.FAR_LEVELS, options.gate)
 
 
 def _again(stream: Stream, how: _Pass, first: list[_Step]) -> list[_Step]:
