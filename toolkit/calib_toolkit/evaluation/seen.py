@@ -96,7 +96,7 @@ def full(figure: Any, rows: Sequence[Row]) -> list[Any]:
                     if known.any():
                         # bars of the motion alone would leave no room to see the others
                         reach = np.abs(error[known]) + (2 * sigma[known] if ending == COMBINED else 0.0)
-                        needed.append(float(np.percentile(reach, 95)))
+                        needed.append(float(reach.max()))
         panel.axhline(0, color="black", lw=0.6)
         for edge in (-paper, paper):
             panel.axhline(edge, color="black", lw=0.8, ls=":")
