@@ -22,10 +22,11 @@ LATE = 2e-3
 DRIVES = 12
 
 
-def lasting(motions, rng):
-    """The motions with faults drawn from what they then state."""
+def lasting(motions, ahead, rng):
+    """The motions with faults drawn from what they then state. ahead: (3,) where the vehicle goes, sensor axes."""
     turned = motions.vec.copy()
     turned[:, :3] = turned[:, :3] @ se3.exp_so3(LEAN * rng.standard_normal(3)).T
+    turned[:, 3:] = turned[:, 3:] @ se3.exp_so3(ahead * (np.linalg.norm(LEAN * ahead) * rng.standard_normal())).T
     return replace(replace(motions, vec=turned, lean=LEAN, late=LATE).shifted(LATE * rng.standard_normal()))
 
 
@@ -37,7 +38,8 @@ def drives():
         rng = np.random.default_rng(seed)
         sensors = [SimulatedSensor(name, T) for name, T in MOUNTS.items()]
         motions = drive(path(40, seed, "street"), sensors, seed)
-        c = calibrate_motions({n: lasting(m, rng) for n, m in motions.items()}, Config()).calibration
+        faulty = {n: lasting(m, MOUNTS[n][0, :3], rng) for n, m in motions.items()}
+        c = calibrate_motions(faulty, Config()).calibration
         true = list(MOUNTS.values())[1:]
         turns.append([turn_error(T[:3, :3], t[:3, :3]) for T, t in zip(c.T_base_sensor[1:], true, strict=True)])
         clocks.append(-c.dt_base_sensor[1:])

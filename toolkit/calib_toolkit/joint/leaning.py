@@ -45,6 +45,17 @@ def late(motions: Sequence[Motions], velocity: Array) -> Array:
     return np.asarray(block_diag(*others) + np.tile(base, (len(others), len(others))))
 
 
+def rolled(motions: Sequence[Motions], R: Array, ahead: Array) -> Array:
+    """(6(n-1), 6(n-1)) of poses: what leans travel turns the turns, too, about where the vehicle goes.
+
+    Across that, travel is told to lean already; about it, it tells nothing. Arguments as of :func:`stated`; ahead:
+    (3,) where the base went.
+    """
+    about = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
+    only = np.kron(np.eye(len(motions) - 1), np.vstack([np.zeros((3, 3)), np.outer(about, about)]))
+    return np.asarray(only @ stated(motions, R) @ only.T)
+
+
 def axes(
     turned: Turning, lean: Array, open_: Sequence[Array], by_turns: Sequence[Array], found: Moving, ahead: Array
 ) -> list[Array]:

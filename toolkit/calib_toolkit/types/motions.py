@@ -21,7 +21,8 @@ class Motions:
     has_scale: False if only the direction of the translation is known (then its length is one).
 
     What more readings do not average out, sigmas of errors that stay as they are through the recording:
-    lean: (3,) radians about the sensor's axes, by which all translations are turned against all rotations.
+    lean: (3,) radians about the sensor's axes, by which all translations are turned against all rotations, and, about
+        where the sensor goes, the axes of all rotations.
     late: seconds by which all motions seem to happen later than their stamps say.
     """
 
