@@ -80,16 +80,16 @@ def estimate(stream: Stream, options: VelodyneOptions) -> Motions:
     return _motions(stream, _again(stream, fine, steps))
 
 
-def deskew(points: Array, times: Array, velocity: Array, more: Array | None = None) -> Array:
+def deskew(points: Array, times: Array, velocity: Array, angular_acceleration: Array | None = None) -> Array:
     """Points, each as measured, moved to where the scanner was at the stamp (paper V-A).
 
     points: (n, 3) metres. times: (n,) seconds from the stamp. velocity: (6,) of ``vec`` per second at the stamp;
-    more: (3,) by which the turn rate changes per second, not by default. The rotation is taken to second order in the
-    time since the stamp: under a millimetre at 50 m and 20 degrees/s. The path is taken as straight and even, which
+    angular_acceleration: (3,) rad/s^2, none by default. The rotation is taken to second order in the time since the
+    stamp: under a millimetre at 50 m and 20 degrees/s. The path is taken as straight and even, which
     in a bend moves all points of a sweep by some millimetres sideways.
     """
     W = se3.skew(velocity[3:])
-    bend = W @ W if more is None else W @ W + se3.skew(more)
+    bend = W @ W if angular_acceleration is None else W @ W + se3.skew(angular_acceleration)
     t = times[:, None]
     return points + t * (points @ W.T + velocity[:3] + (0.5 * t) * (points @ bend.T))
 
@@ -137,11 +137,13 @@ class _Sweep:
     def enough(self) -> bool:
         return len(self.points) >= self.options.min_points
 
-    def surface(self, velocity: Array | None, more: Array | None = None) -> Surface:
-        """What it saw, its points moved to the stamp by a velocity (6,) and the change of its turn rate (3,)."""
+    def surface(self, velocity: Array | None, angular_acceleration: Array | None = None) -> Surface:
+        """What it saw, its points moved to the stamp by a velocity (6,) and an angular acceleration (3,)."""
         if velocity is None or self.times is None:
             return registration.surface(self.points, self.options.cell)
-        return registration.surface(deskew(self.points, self.times, velocity, more), self.options.cell)
+        return registration.surface(
+            deskew(self.points, self.times, velocity, angular_acceleration), self.options.cell
+        )
 
 
 _Step = tuple[Array, Array] | None
