@@ -129,8 +129,8 @@ def _intrinsics(file: Path) -> CameraIntrinsics:
         raise DataError(f"{file}: a '{model}' camera of focal lengths {fx:g} and {fy:g} is no pinhole; undistort it")
     width, height = (int(x) for x in _numbers(said, "resolution", 2, file))
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    distortion = said.get("distortion_coefficients") or []
-    D = _numbers(said, "distortion_coefficients", 4, file) if distortion else np.zeros(0)
+    distorted = lens not in ("", "none") or said.get("distortion_coefficients")
+    D = _numbers(said, "distortion_coefficients", 4, file) if distorted else np.zeros(0)
     if np.any(D) and lens not in RADTAN:
         raise DataError(f"{file}: its distortion is '{lens}', not radial-tangential; undistort its images")
     return CameraIntrinsics(K, D, (width, height))

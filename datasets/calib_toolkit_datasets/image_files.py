@@ -1,5 +1,6 @@
 """Jpeg and png files, of which all must be there: OpenCV makes something of one that was cut short."""
 
+from collections.abc import Sequence
 from os.path import isfile
 from pathlib import Path
 from zlib import crc32
@@ -59,8 +60,8 @@ def listed(
 ) -> tuple[tables.Nanoseconds, list[Path], tuple[str, ...]]:
     """Stamps (n,), increasing, and images of a list whose rows are a stamp in ``unit`` seconds and a file's name.
 
-    folder: where the names start. root: what no name may lead out of. Images that are missing and stamps that go back
-    or repeat are left out, which sentences say. Raises DataError.
+    folder: where the names start. root: what no name may lead out of. Images that are missing, stamps that go back
+    or repeat, and images beside those that the list does not name are left out, which sentences say. Raises DataError.
     """
     rows = tables.read_rows(file, 2, 2)
     ns = tables.to_nanoseconds(rows, unit)
@@ -78,7 +79,14 @@ def listed(
         notes.append(f"{name}: {late} of {len(rows)} images whose stamps repeat or go back are left out")
     if len(keep) < 2:
         raise DataError(f"{file} lists {len(keep)} images that are there and have a stamp; a motion takes two")
+    if unlisted := sorted(_beside([paths[k] for k in keep]).difference(paths)):
+        notes.append(f"{name}: {len(unlisted)} images are not in {file}, the first of them {unlisted[0].name}")
     return ns[keep], [paths[k] for k in keep], tuple(notes)
+
+
+def _beside(files: Sequence[Path]) -> set[Path]:
+    """All files of the same kinds in the same folders."""
+    return {f for folder, kind in {(p.parent, p.suffix) for p in files} for f in folder.glob(f"*{kind}")}
 
 
 def size_of(raw: bytes) -> tuple[int, int]:

@@ -125,6 +125,15 @@ def test_a_fisheye_has_no_intrinsics(tmp_path):
     assert "equidistant" in said(log)
 
 
+def test_a_lens_without_its_coefficients_has_no_intrinsics(tmp_path):
+    root = build.euroc(tmp_path)
+    text = build.CAMERA_YAML.replace("distortion_coefficients", "distort")
+    (root / "mav0/cam0/sensor.yaml").write_text(text)
+    log = opened(root)
+    assert log.streams["cam0"].intrinsics is None
+    assert "'distortion_coefficients' must be 4 numbers" in said(log)
+
+
 @pytest.mark.parametrize("name", ["../../../../secret.png", "{root}/secret.png"])
 def test_a_name_that_leaves_the_folder_is_refused(tmp_path, name):
     root = build.euroc(tmp_path / "drive")
@@ -173,6 +182,14 @@ def test_images_that_are_missing_or_stamped_twice_are_counted(tmp_path):
     assert len(log.streams["rgb"]) == 11
     assert "1 of 13 images have no file" in said(log)
     assert "1 of 13 images whose stamps repeat" in said(log)
+
+
+def test_images_that_a_list_does_not_name_are_counted(tmp_path):
+    root = build.euroc(tmp_path)
+    assert "images are not in" not in said(opened(root))
+    rows = (root / "mav0/cam0/data.csv").read_text().splitlines()
+    (root / "mav0/cam0/data.csv").write_text("\n".join(rows[:-3]) + "\n")
+    assert "cam0: 3 images are not in" in said(opened(root))
 
 
 LAYOUTS = {
