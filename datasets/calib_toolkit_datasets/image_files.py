@@ -61,7 +61,7 @@ def listed(
     """Stamps (n,), increasing, and images of a list whose rows are a stamp in ``unit`` seconds and a file's name.
 
     folder: where the names start. root: what no name may lead out of. Images that are missing, stamps that go back
-    or repeat, and images beside those that the list does not name are left out, which sentences say. Raises DataError.
+    or repeat, and images beside them that it does not name are left out, which sentences say. Raises DataError.
     """
     rows = tables.read_rows(file, 2, 2)
     ns = tables.to_nanoseconds(rows, unit)
