@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 EPIPOLE = 20.0  # sigmas around an epipole in which points count less and less
+ALIKE = 1e6  # sigmas of a residual, at which all points count alike
 
 
 @dataclass(frozen=True)
@@ -85,17 +86,25 @@ def sampson(prev: Points, curr: Points, R: Array, t: Array) -> tuple[Array, Arra
     return r[:, 0], error[:, 1:] / np.sqrt(var) - r / var * half_d_var
 
 
-def refine(prev: Points, curr: Points, R: Array, t: Array) -> tuple[Array, Array]:
-    """(R, t) of least Sampson error, by Levenberg-Marquardt from a start."""
+def refine(prev: Points, curr: Points, R: Array, t: Array, scale: float = ALIKE) -> tuple[Array, Array]:
+    """(R, t) of least Sampson error, by Levenberg-Marquardt from a start.
+
+    scale: sigmas of a residual beyond which a point counts less and less (Cauchy's weights).
+    """
+
+    def cost(r: Array) -> float:
+        return float(scale**2 * np.sum(np.log1p((r / scale) ** 2)))
+
     r, J = sampson(prev, curr, R, t)
     damping = 1e-6
     for _ in range(20):
-        H = J.T @ J
-        step = np.linalg.lstsq(H + damping * np.diag(np.diag(H)), -J.T @ r, rcond=1e-14)[0]
+        weighted = J / (1 + (r / scale) ** 2)[:, None]
+        H = weighted.T @ J
+        step = np.linalg.lstsq(H + damping * np.diag(np.diag(H)), -weighted.T @ r, rcond=1e-14)[0]
         R_new, t_new = se3.exp_so3(step[:3]) @ R, t + tangent(t) @ step[3:]
         t_new /= np.linalg.norm(t_new)
         r_new, J_new = sampson(prev, curr, R_new, t_new)
-        gain = r @ r - r_new @ r_new
+        gain = cost(r) - cost(r_new)
         if gain > 0:
             R, t, r, J, damping = R_new, t_new, r_new, J_new, damping / 10
         else:

@@ -9,7 +9,7 @@ from calib_toolkit_plugins.monocular import MonocularOptions, estimate
 @hookimpl
 def calib_register_sensors() -> list[Sensor]:
     """The ``ladybug`` sensor: a head moves as a monocular camera does."""
-    return [Sensor("ladybug", estimate, MonocularOptions, open_table, version="2")]
+    return [Sensor("ladybug", estimate, MonocularOptions, open_table, version="3")]
 
 
 def open_table(table: SensorTable) -> Log:

@@ -42,7 +42,7 @@ class MonocularOptions:
 @hookimpl
 def calib_register_sensors() -> list[Sensor]:
     """The ``monocular`` sensor."""
-    return [Sensor("monocular", estimate, MonocularOptions, open_table, version="2")]
+    return [Sensor("monocular", estimate, MonocularOptions, open_table, version="3")]
 
 
 def open_table(table: SensorTable) -> Log:

@@ -24,6 +24,7 @@ from calib_toolkit_plugins.epipolar import (
 
 GATE, WIDE_GATE = 3.0, 5.0  # sigmas of a Sampson residual; beyond it a point is an outlier (at first, a wider one)
 RANGE_OF_NOISE = (0.2, 1.0)  # the measured noise tightens the gate, within these parts of the stated noise
+CAUCHY = 1.31  # times the variance of least squares, what such weights leave of Gaussian noise
 MIN_POINTS = 20
 MIN_SHARE = 0.4  # of the points must agree with the motion, or it is no motion of the scene
 MIN_IN_FRONT = 2 / 3  # of the agreeing points must lie in front of both cameras, or the sign is a guess
@@ -69,7 +70,7 @@ def two_view_motion(prev: Points, curr: Points) -> TwoViewMotion | None:
         still = np.mean(squares < (GATE * _noise(r)) ** 2)
         p, c = prev[inliers], curr[inliers]
         if _gric(r**2, 3, 5) < _gric(squares, 2, 3) and still < MAX_STILL and not _ambiguous(p, c, R, t):
-            cov = covariance(p, c, R, t)
+            cov = CAUCHY * covariance(p, c, R, t)
             seen = np.max(np.diag(cov)[3:]) < MAX_DIRECTION_SIGMA**2 and np.mean(in_front(p, c, R, t)) > MIN_IN_FRONT
             return TwoViewMotion(R, t, cov, inliers) if seen else TwoViewMotion(R, None, cov[:3, :3], inliers)
     agree = squares < GATE**2
@@ -119,7 +120,12 @@ def _move(prev: Points, curr: Points) -> tuple[Array, Array, Mask] | None:
     for _ in range(2):
         best = sorted(fits, key=lambda fit: np.sum(np.minimum(sampson(prev, curr, *fit[:2])[0] ** 2, GATE**2)))[:1]
         fits = [fit for R, t, _ in best for fit in _regated(prev, curr, R, t, GATE)]
-    return fits[0] if fits else None
+    if not fits:
+        return None
+    R, t, inliers = fits[0]
+    p, c = prev[inliers], curr[inliers]
+    # where one thing hides another, corners of their outlines lie on neither: they err within the gate, all one way
+    return *refine(p, c, R, t, _noise(sampson(p, c, R, t)[0])), inliers
 
 
 def _regated(prev: Points, curr: Points, R: Array, t: Array, gate: float) -> list[tuple[Array, Array, Mask]]:
