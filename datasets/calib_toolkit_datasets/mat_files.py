@@ -5,18 +5,21 @@ import struct
 import zlib
 
 HEADER = 128
-NUMBERS = frozenset((*range(1, 8), 9, 12, 13, 16, 17, 18))
+BYTES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 16: 1, 17: 2, 18: 4}
+"""Of a number, by the type of its element."""
+INT8, INT32, UINT32 = 1, 5, 6
 MATRIX, COMPRESSED = 14, 15
-NESTED_CLASSES = (1, 2, 3)
-"""Cells, structs and objects: the classes whose elements are matrices again."""
+CELL, STRUCT, ARRAYS = 1, 2, (4, *range(6, 16))
+"""Classes of variables: lists, structs, and text or numbers. Files of motions hold no others."""
+COMPLEX = 0x0800
+"""In the flags that hold the class."""
 DEEPEST = 32
 
 
 def refuse_damage(raw: bytes) -> None:
-    """Raises ValueError where an element has no known type, says more than the file holds, or lies too deep.
+    """Raises ValueError unless each variable has all its parts, of the types and sizes that they must have.
 
-    SciPy looks a type up in a table without asking whether it is there, which ends the process, and makes as many
-    structs as a file says. ``raw``: all bytes of a file.
+    SciPy takes that for granted: where it is not so, the process may end. ``raw``: all bytes of a file.
     """
     order = ">" if raw[126:128] == b"MI" else "<"
     for kind, body in _elements(raw[HEADER:], order):
@@ -35,17 +38,41 @@ def _check(kind: int, body: bytes, order: str, depth: int) -> None:
     if depth > DEEPEST:
         raise ValueError(f"its variables lie more than {DEEPEST} deep in one another")
     parts = _elements(body, order)
-    flags = parts[0][1]
-    nested = len(flags) == 8 and struct.unpack_from(f"{order}I", flags)[0] & 0xFF in NESTED_CLASSES
-    dims = parts[1][1] if len(parts) > 1 else b""
-    count = math.prod(struct.unpack(f"{order}{len(dims) // 4}i", dims[: len(dims) // 4 * 4]))
-    if nested and count > len(body):
+    if [kind for kind, _ in parts[:3]] != [UINT32, INT32, INT8] or len(parts[0][1]) != 8 or len(parts[1][1]) % 4:
+        raise ValueError("a variable does not begin with its class, size and name")
+    (flags,) = struct.unpack_from(f"{order}I", parts[0][1])
+    sizes = struct.unpack(f"{order}{len(parts[1][1]) // 4}i", parts[1][1])
+    count = math.prod(sizes)
+    if len(sizes) < 2 or min(sizes) < 0 or count > len(body):
         raise ValueError(f"a variable says {count} parts in {len(body)} bytes")
-    for inner, unpacked in parts:
-        if inner == MATRIX and nested:
-            _check(inner, unpacked, order, depth + 1)
-        elif inner not in NUMBERS:
-            raise ValueError(f"an element of type {inner} stands where numbers belong")
+    held, of_class = parts[3:], flags & 0xFF
+    if of_class in ARRAYS:
+        _check_array(held, count, bool(flags & COMPLEX))
+        return
+    if of_class not in (CELL, STRUCT):
+        raise ValueError(f"a variable of class {of_class} is neither numbers, text, a cell nor a struct")
+    if of_class == STRUCT:
+        held, count = parts[5:], count * _fields(parts[3:5], order)
+    if len(held) != count:
+        raise ValueError(f"a variable says {count} parts and has {len(held)}")
+    for inner, unpacked in held:
+        _check(inner, unpacked, order, depth + 1)
+
+
+def _check_array(parts: list[tuple[int, bytes]], count: int, has_imaginary: bool) -> None:
+    """The numbers, or the letters, of an array of so many, and their imaginary parts."""
+    if len(parts) != 1 + has_imaginary or any(len(body) != count * BYTES.get(kind, 0) for kind, body in parts):
+        raise ValueError(f"an array of {count} numbers holds something else")
+
+
+def _fields(parts: list[tuple[int, bytes]], order: str) -> int:
+    """How many fields a struct has, by the length of a name and all names."""
+    if [kind for kind, _ in parts] != [INT32, INT8] or len(parts[0][1]) != 4:
+        raise ValueError("a struct has no names of fields")
+    (length,) = struct.unpack(f"{order}i", parts[0][1])
+    if length < 1 or len(parts[1][1]) % length:
+        raise ValueError(f"a struct's names of {length} letters fill {len(parts[1][1])}")
+    return len(parts[1][1]) // length
 
 
 def _elements(raw: bytes, order: str) -> list[tuple[int, bytes]]:

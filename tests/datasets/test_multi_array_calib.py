@@ -154,6 +154,9 @@ def test_damaged_files_are_named(tmp_path: Path) -> None:
         (0, b"\0"),  # a type that SciPy's table of types does not have
         (0, b"\x0e"),  # a matrix where numbers belong
         (4, b"\xff\xff"),  # more bytes than there are
+        (-31, b"\x08"),  # complex, and no imaginary part
+        (-32, b"\x05"),  # sparse
+        (-16, b"\x09"),  # a row more than there are
     ],
 )
 def test_an_element_that_would_end_the_process_is_refused(tmp_path: Path, at: int, content: bytes) -> None:
