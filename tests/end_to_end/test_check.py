@@ -165,7 +165,10 @@ def test_a_folder_that_does_not_exist_is_refused_before_the_work(check, tmp_path
 
 @pytest.mark.long
 def test_the_published_calibration_of_a_recording(recordings, tmp_path):
-    """Its place is told to be right to what draws from these five seconds find it off by: 3 cm and 0.14 degrees."""
+    """Its place is told to be right to what draws from these five seconds find it off by: 3 cm and 0.14 degrees.
+
+    Or not judged, as one draw in eight is not: these five seconds hardly tell where along the road a camera is.
+    """
     drive = recordings / "kitti360-3000"
     rig = calibration_dict(open_log(drive).reference)
     (tmp_path / "rig.json").write_text(json.dumps(rig))
@@ -174,5 +177,8 @@ def test_the_published_calibration_of_a_recording(recordings, tmp_path):
     assert done.exit_code in (0, 3), done.output
     (pair,) = json.loads((tmp_path / "check.json").read_text())["pairs"]
     assert not any(pair["better"][axis] for axis in ("y", "z"))
-    assert all(abs(pair["metrics"]["im"]["move"][axis]) < np.radians(0.2) for axis in ("rx", "ry", "rz"))
+    im = pair["metrics"]["im"]
+    judged = im["note"] != "two searches end far from each other"
+    assert judged == all(pair["shown"][axis] for axis in ("rx", "ry", "rz"))
+    assert not judged or all(abs(im["move"][axis]) < np.radians(0.2) for axis in ("rx", "ry", "rz"))
     assert read_calibration(tmp_path / "rig.json").names == (pair["a"], pair["b"])
