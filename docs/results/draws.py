@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from summaries import table, tell
 
-from calib_toolkit import Calibration, Config, CostMetric, Log, Pair, PairEstimate, Transform, open_log, se3
+from calib_toolkit import Calibration, Config, Log, Pair, PairEstimate, Transform, open_log, se3
 from calib_toolkit.appearance.pairs import select
 from calib_toolkit.appearance.search import estimate
 from calib_toolkit.cache import default_folder
@@ -74,8 +74,6 @@ def drawn(
     selected = select(log.streams[a], log.streams[b], motion[a], late, frames, seed)
     selected = selected if half is None else selected[half::2]
     chosen, rng, found = registry().metrics[metric], np.random.default_rng(seed), []
-    if isinstance(chosen, CostMetric):
-        remember(chosen)
     sigma = np.array([shift] * 3 + [np.radians(turn)] * 3)
     for k in range(draws):
         error = _within(rng, sigma)
@@ -88,20 +86,6 @@ def drawn(
         found.append(Draw(start, alone, together(prior, alone) if alone.converged else None))
         click.echo(f"{k}: {alone.note or _line(found[-1], reference)}", err=True)
     return found
-
-
-def remember(metric: CostMetric) -> None:
-    """Have the metric read a frame once only, for many draws look at it."""
-    once: dict[bytes, Any] = {}
-    prepare = metric.prepare
-
-    def prepared(pair: Pair, options: Any) -> Any:
-        key = pair.selected.tobytes()
-        if key not in once:
-            once[key] = prepare(pair, options)
-        return once[key]
-
-    metric.prepare = prepared  # type: ignore[method-assign]
 
 
 def together(prior: Transform, alone: PairEstimate) -> Calibration | None:
