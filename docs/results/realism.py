@@ -24,7 +24,7 @@ from calib_toolkit_datasets.simulation import vehicle
 from calib_toolkit_datasets.simulation.lidar import LidarModel
 from calib_toolkit_datasets.simulation.rigs import START_NS
 from calib_toolkit_datasets.simulation.writing import Wish, build_rig
-from calib_toolkit_plugins import monocular, registration, velodyne
+from calib_toolkit_plugins import deskewing, monocular, registration, velodyne
 from calib_toolkit_plugins.epipolar import sampson
 from calib_toolkit_plugins.two_view import two_view_motion
 
@@ -104,12 +104,12 @@ def scan_figures(stream: Stream) -> Figures:
         velocity = np.array([np.interp(stamp, middle, r) for r in rate.T])
         far = np.linalg.norm(scan.points, axis=1)
         used = (far > options.min_range) & (far < options.max_range)
-        moved = velodyne.deskew(scan.points[used].astype(float), scan.times[used].astype(float), velocity)
+        moved = deskewing.deskew(scan.points[used].astype(float), scan.times[used].astype(float), velocity)
         surfaces.append(registration.surface(moved, options.cell))
         points.append(len(far))
     rows = []
     for k, T in zip(np.searchsorted(stream.stamps, motions.start), se3.matrix(motions.vec), strict=True):
-        left = registration.plane_residuals(surfaces[k], surfaces[k + 1], T, options.gate)
+        left = registration.plane_residuals(surfaces[k], surfaces[k + 1].points, T, options.gate)
         rows.append([len(surfaces[k].points), 1e3 * np.median(np.abs(left.errors)), 100 * left.overlap])
     names = ("points after thinning", "distance from the plane, median, mm", "overlap, %")
     return {"points in a sweep": float(np.median(points)), **dict(zip(names, np.median(rows, axis=0), strict=True))}

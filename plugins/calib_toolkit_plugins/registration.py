@@ -82,12 +82,13 @@ def register(prev: Surface, curr: Surface, T_seed: Array, levels: Sequence[float
 class PlaneResiduals:
     """Distances of one scan's points from the planes of the other, linearised in the motion.
 
-    T_prev_curr: (4, 4) where they were taken. points: (m, 3) of the current scan, its frame. planes: (m,) the
-    row of each one's neighbour in the previous scan; targets, normals: (m, 3) its point and normal.
-    errors: (m,) metres. overlap: share of all points that lie within the gate of a plane.
+    T_prev_curr: (4, 4) where they were taken. rows: (m,) of the points that lie within the gate of a plane; points:
+    (m, 3) those, frame of the current scan. planes: (m,) the row of each one's neighbour in the previous scan;
+    targets, normals: (m, 3) its point and normal. errors: (m,) metres. overlap: m as a share of all.
     """
 
     T_prev_curr: Array
+    rows: NDArray[np.int64]
     points: Array
     planes: NDArray[np.int64]
     targets: Array
@@ -103,9 +104,9 @@ class PlaneResiduals:
         return np.hstack([self.normals, np.cross(lever, self.normals) @ turn])
 
 
-def plane_residuals(prev: Surface, curr: Surface, T_prev_curr: Array, gate: float) -> PlaneResiduals:
-    """Point-to-plane residuals below ``gate`` metres (paper V-A) at a motion."""
-    moved = curr.points @ T_prev_curr[:3, :3].T + T_prev_curr[:3, 3]
+def plane_residuals(prev: Surface, points: Array, T_prev_curr: Array, gate: float) -> PlaneResiduals:
+    """Point-to-plane residuals below ``gate`` metres (paper V-A) of points (n, 3) at a motion."""
+    moved = points @ T_prev_curr[:3, :3].T + T_prev_curr[:3, 3]
     rows, squared = prev.tree.batch_knn_search(moved, 1)
     planes = np.minimum(rows[:, 0], len(prev.points) - 1).astype(np.int64)
     errors = np.einsum("ij,ij->i", moved - prev.points[planes], prev.normals[planes])
@@ -113,7 +114,8 @@ def plane_residuals(prev: Surface, curr: Surface, T_prev_curr: Array, gate: floa
     kept = planes[near]
     return PlaneResiduals(
         T_prev_curr,
-        curr.points[near],
+        np.flatnonzero(near),
+        points[near],
         kept,
         prev.points[kept],
         prev.normals[kept],
@@ -126,7 +128,7 @@ def point_to_plane(prev: Surface, curr: Surface, T_seed: Array, gate: float, ite
     """``T_prev_curr`` by iterated point-to-plane least squares with the gate of paper V-A."""
     vec = se3.vector(T_seed)
     for _ in range(iterations):
-        residuals = plane_residuals(prev, curr, se3.matrix(vec), gate)
+        residuals = plane_residuals(prev, curr.points, se3.matrix(vec), gate)
         vec = vec - np.linalg.lstsq(residuals.jacobian, residuals.errors, rcond=None)[0]
     return se3.matrix(vec)
 

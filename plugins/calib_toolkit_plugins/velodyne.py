@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from calib_toolkit import DataError, Motions, Sensor, Stream, hookimpl, se3
 from calib_toolkit_plugins import registration, world_frame
+from calib_toolkit_plugins.deskewing import derivatives, deskew, settled
 from calib_toolkit_plugins.registration import Surface
 from calib_toolkit_plugins.scan_tables import open_table
 
@@ -57,7 +58,7 @@ class VelodyneOptions:
 @hookimpl
 def calib_register_sensors() -> list[Sensor]:
     """The ``velodyne`` sensor."""
-    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="11")]
+    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="12")]
 
 
 def estimate(stream: Stream, options: VelodyneOptions) -> Motions:
@@ -66,12 +67,13 @@ def estimate(stream: Stream, options: VelodyneOptions) -> Motions:
     Each sweep is laid on the last few. In the first pass, a coarse one, the previous motion is the first guess and
     moves the points of a sweep to its stamp, as in the paper. But roll and pitch change within a sweep, which would
     hide some hundredths of them: the other two, coarse and fine, move the points as the steps before and after say,
-    changes of the turn rate included. A step that fails (too few points, too little overlap, a jump) is left out.
+    changes of the turn rate included, and the last finds what else the vehicle shook (:mod:`deskewing`). A step that
+    fails (too few points, too little overlap, a jump) is left out.
     Raises DataError with fewer than two readings, or one that is not a scan.
     """
     if len(stream) < 2:
         raise DataError(f"sensor {stream.name}: a motion takes two scans, and there are {len(stream)}")
-    fine = _Pass(options, LOCAL)
+    fine = _Pass(options, LOCAL, shakes=not options.point_to_plane)
     timed = options.deskew and getattr(stream.readings[0], "times", None) is not None
     coarse = _Pass(replace(options, cell=COARSER * options.cell), COARSE_LOCAL, COARSE_POINTS) if timed else fine
     steps = _checked(stream, options, *_first_pass(stream, coarse))
@@ -80,28 +82,16 @@ def estimate(stream: Stream, options: VelodyneOptions) -> Motions:
     return _motions(stream, _again(stream, fine, steps))
 
 
-def deskew(points: Array, times: Array, velocity: Array, angular_acceleration: Array | None = None) -> Array:
-    """Points, each as measured, moved to where the scanner was at the stamp (paper V-A).
-
-    points: (n, 3) metres. times: (n,) seconds from the stamp. velocity: (6,) of ``vec`` per second at the stamp;
-    angular_acceleration: (3,) rad/s^2, none by default. The rotation is taken to second order in the time since the
-    stamp: under a millimetre at 50 m and 20 degrees/s. The path is taken as straight and even, which
-    in a bend moves all points of a sweep by some millimetres sideways.
-    """
-    W = se3.skew(velocity[3:])
-    bend = W @ W if angular_acceleration is None else W @ W + se3.skew(angular_acceleration)
-    t = times[:, None]
-    return points + t * (points @ W.T + velocity[:3] + (0.5 * t) * (points @ bend.T))
-
-
 @dataclass(frozen=True)
 class _Pass:
     """How closely sweeps are looked at. local: cells of the last ones on which the next is laid. points: about as
-    many of each are taken; all by default."""
+    many of each are taken; all by default. shakes: whether to look for motion within a sweep that the steps around
+    it do not show."""
 
     options: VelodyneOptions
     local: int
     points: int | None = None
+    shakes: bool = False
 
 
 @dataclass(frozen=True)
@@ -137,13 +127,19 @@ class _Sweep:
     def enough(self) -> bool:
         return len(self.points) >= self.options.min_points
 
-    def surface(self, velocity: Array | None, angular_acceleration: Array | None = None) -> Surface:
-        """What it saw, its points moved to the stamp by a velocity (6,) and an angular acceleration (3,)."""
-        if velocity is None or self.times is None:
-            return registration.surface(self.points, self.options.cell)
-        return registration.surface(
-            deskew(self.points, self.times, velocity, angular_acceleration), self.options.cell
-        )
+    def straight(self, velocity: Array | None, change: Array | None = None) -> "_Sweep":
+        """With all points moved to the stamp; velocity and its change as :func:`deskewing.deskew` takes them."""
+        if velocity is None or self.times is None or np.isnan(velocity[0]):
+            return self
+        return replace(self, points=deskew(self.points, self.times, velocity, change))
+
+    @property
+    def surface(self) -> Surface:
+        return registration.surface(self.points, self.options.cell)
+
+    @property
+    def thinned(self) -> Array:
+        return registration.thinned(self.points, self.options.cell)
 
 
 _Step = tuple[Array, Array] | None
@@ -174,11 +170,10 @@ def _first_pass(stream: Stream, how: _Pass) -> tuple[list[_Step], Array]:
             velocity = se3.vector(seed) / dt
         step = None
         if prev.enough and curr.enough and seed is not None:
-            last = last or [prev.surface(velocity).points]
-            made = curr.surface(velocity)
-            step = _step(registration.surface(np.concatenate(last), options.cell), made, seed, options)
+            last = last or [prev.straight(velocity).thinned]
+            step, points = _laid(last, curr.straight(velocity), seed, how)
         velocity = None if step is None else se3.vector(step[0]) / dt
-        last = [] if step is None else _enough([made.points, *_moved(last, se3.invert(step[0]))], how.local)
+        last = [] if step is None else _enough([points, *_moved(last, se3.invert(step[0]))], how.local)
         steps.append(step)
         prev = curr
         seen.append(curr.seen)
@@ -187,17 +182,17 @@ def _first_pass(stream: Stream, how: _Pass) -> tuple[list[_Step], Array]:
 
 def _from_nothing(stream: Stream, k: int, options: VelodyneOptions) -> Array:
     """``T_prev_curr`` (4, 4) of the step to sweep k where nothing is foreseen, from all points."""
-    prev, curr = (_Sweep.read(stream, i, _Pass(options, 0)).surface(None) for i in (k - 1, k))
+    prev, curr = (_Sweep.read(stream, i, _Pass(options, 0)).surface for i in (k - 1, k))
     return registration.register(prev, curr, np.eye(4), registration.FAR_LEVELS, options.gate)
 
 
 def _again(stream: Stream, how: _Pass, first: list[_Step]) -> list[_Step]:
     """The steps once more, sweeps straightened by them: each on the last ones; or, where there are not enough of
     those yet, the sweep before on the next ones."""
-    options, moving = how.options, _derivatives(stream, first)
+    moving = [*zip(*derivatives(stream.stamps, [None if s is None else s[0] for s in first]), strict=True)]
 
-    def seen(k: int) -> Surface:
-        return _Sweep.read(stream, k, how).surface(*moving[k])
+    def seen(k: int) -> _Sweep:
+        return _Sweep.read(stream, k, how).straight(*moving[k])
 
     steps, early = list(first), []
     last: list[Array] = []  # the newest first, all where the scanner was at its stamp
@@ -205,44 +200,34 @@ def _again(stream: Stream, how: _Pass, first: list[_Step]) -> list[_Step]:
         if seed is None:
             last = []
             continue
-        last = last or [seen(k).points]
+        last = last or [seen(k).thinned]
         if sum(map(len, last)) < how.local:
             early.append(k)
-        curr = seen(k + 1)
-        steps[k] = step = _step(registration.surface(np.concatenate(last), options.cell), curr, seed[0], options)
-        last = [] if step is None else _enough([curr.points, *_moved(last, se3.invert(step[0]))], how.local)
+        steps[k], points = _laid(last, seen(k + 1), seed[0], how)
+        step = steps[k]
+        last = [] if step is None else _enough([points, *_moved(last, se3.invert(step[0]))], how.local)
     for k in reversed(early):
         if (step := steps[k]) is not None:
-            later, T = [seen(k + 1).points], np.eye(4)
+            later, T = [seen(k + 1).thinned], np.eye(4)
             for i in range(k + 1, len(steps)):
                 if (after := steps[i]) is None or sum(map(len, later)) >= how.local:
                     break
                 T = T @ after[0]
-                later += _moved([seen(i + 1).points], T)
-            ahead = registration.surface(np.concatenate(later), options.cell)
-            back = _step(ahead, seen(k), se3.invert(step[0]), options) if len(later) > 1 else None
+                later += _moved([seen(i + 1).thinned], T)
+            back = _laid(later, seen(k), se3.invert(step[0]), how)[0] if len(later) > 1 else None
             steps[k] = step if back is None else _inverse(*back)
     return steps
 
 
-def _derivatives(stream: Stream, steps: list[_Step]) -> list[tuple[Array | None, Array | None]]:
-    """(6,) of ``vec`` per second at each stamp, and by how much its turn rate changes per second (3,): of the four
-    steps around it, the derivatives of the quartic through their ends; of those beside it where some are missing.
-
-    How travel changes is not asked: along a bare street the answer would be noise, which the next pass would add to.
-    """
-    dt = np.diff(stream.stamps)
-    each = [None if s is None else se3.vector(s[0]) / t for s, t in zip(steps, dt, strict=True)]
-    found: list[tuple[Array | None, Array | None]] = []
-    for k in range(len(stream)):
-        around = each[max(k - 2, 0) : k + 2]
-        known = [v for v in each[max(k - 1, 0) : k + 1] if v is not None]
-        if len(around) == 4 and all(v is not None for v in around):
-            first, second = np.tensordot([[-1, 7, 7, -1], [1, -15, 15, -1]], np.array(around), 1) / 12
-            found.append((first, second[3:] / dt[k]))
-        else:
-            found.append((np.mean(known, axis=0) if known else None, None))
-    return found
+def _laid(clouds: Sequence[Array], sweep: _Sweep, T_seed: Array, how: _Pass) -> tuple[_Step, Array]:
+    """The step from the frame of the clouds to a sweep's, and points (m, 3) of the sweep."""
+    options = how.options
+    onto, curr = registration.surface(np.concatenate(clouds), options.cell), sweep.surface
+    step = _step(onto, curr, T_seed, options)
+    if step is None or sweep.times is None or not how.shakes:
+        return step, curr.points
+    T, points = settled(onto, sweep.points, sweep.times, step[0], options.cell, options.gate)
+    return (T, step[1]), points
 
 
 def _enough(clouds: list[Array], cells: int) -> list[Array]:
@@ -269,7 +254,7 @@ def _step(prev: Surface, curr: Surface, T_seed: Array, options: VelodyneOptions)
         T = registration.point_to_plane(prev, curr, T, options.gate)
     if np.linalg.norm(T[:3, 3] - T_seed[:3, 3]) > options.max_jump:
         return None
-    residuals = registration.plane_residuals(prev, curr, T, options.gate)
+    residuals = registration.plane_residuals(prev, curr.points, T, options.gate)
     if residuals.overlap < options.min_overlap or len(residuals.errors) < options.min_points:
         return None
     cov = registration.range_covariance(residuals, options.range_sigma, options.max_jump)

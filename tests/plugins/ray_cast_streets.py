@@ -1,5 +1,6 @@
 """Sweeps of a moving scanner on ray-cast streets, the motion being known."""
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -44,13 +45,26 @@ def sweep(
 ) -> Scan:
     """One clockwise sweep of a scanner that moves by ``step`` a period, and by ``more`` of it each period; its stamp
     is the middle."""
+    return swept(
+        boxes,
+        lambda part: T_world_mid @ se3.matrix(part[:, None] * step + part[:, None] ** 2 / 2 * more),
+        rng,
+        sigma,
+        rings,
+    )
+
+
+def swept(
+    boxes: Array, path: Callable[[Array], Array], rng: np.random.Generator, sigma: float, rings: int = BEAMS
+) -> Scan:
+    """One clockwise sweep from where path, of periods since the middle of it, (n,) to (n, 4, 4), says."""
     azimuth = -np.pi + (np.arange(COLUMNS) + 0.5) * 2 * np.pi / COLUMNS
     azimuth, elevation = (m.ravel() for m in np.meshgrid(azimuth, np.radians(np.linspace(-24.8, 2, rings))))
     part = -azimuth / (2 * np.pi)
     beams = np.stack(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=1
     )
-    T = T_world_mid @ se3.matrix(part[:, None] * step + part[:, None] ** 2 / 2 * more)
+    T = path(part)
     ranges = first_hit(boxes, T[:, :3, 3], np.einsum("nij,nj->ni", T[:, :3, :3], beams))
     hit = ranges < 80.0
     ranges = ranges + sigma * rng.standard_normal(len(ranges))

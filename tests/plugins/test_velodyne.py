@@ -5,11 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ray_cast_streets import FORWARD, PERIOD, Array, drive, forward, street, sweep
+from ray_cast_streets import FORWARD, GROUND, PERIOD, Array, drive, forward, street, sweep, swept
 
 from calib_toolkit import DataError, Motions, Scan, Stream, se3
 from calib_toolkit_plugins import registration
-from calib_toolkit_plugins.velodyne import VelodyneOptions, deskew, estimate
+from calib_toolkit_plugins.deskewing import derivatives, deskew
+from calib_toolkit_plugins.velodyne import VelodyneOptions, estimate
 
 TUNNEL = np.array([[0.0, side, 2.0, 150.0, 1.0, 6.0, 0.0] for side in (-9.0, 9.0)])
 
@@ -57,6 +58,28 @@ def test_wobble_does_not_show() -> None:
     assert error < 0.0004  # 0.00047 if each sweep is taken to turn evenly
 
 
+def test_the_swing_of_a_mast_shows() -> None:
+    """A vehicle that rolls and pitches about the ground: its lidar swings by all of its height."""
+    mast = np.array([0.0, 0.0, -GROUND])
+
+    def path(part: Array) -> Array:
+        t = PERIOD * part
+        roll, pitch = 0.01 * np.sin(2 * np.pi * 1.7 * t), 0.012 * np.sin(2 * np.pi * 2.3 * t + 1)
+        T = se3.matrix(np.stack([8 * t, 0 * t, 0 * t, roll, pitch, 0 * t], axis=1))
+        T[:, :3, 3] += T[:, :3, :3] @ mast - mast
+        return T
+
+    rng = np.random.default_rng(0)
+    scans = [swept(street(5), lambda part, k=k: path(part + k), rng, 0.02) for k in range(16)]
+    found = estimate(Stream("velo", "velodyne", PERIOD * np.arange(16), scans), VelodyneOptions()).vec
+    poses = path(np.arange(16.0))
+    true = se3.vector(se3.relative(poses[:-1], poses[1:]))
+    swing = true[:, [0, 1]] - [0.8, 0.0]
+    shown = np.sum((found[:, [0, 1]] - [0.8, 0.0]) * swing, axis=0) / np.sum(swing**2, axis=0)
+    assert np.all(np.abs(shown - 1) < 0.03), shown  # 0.92 and 0.95 if only turns change within a sweep
+    assert np.sqrt(np.mean((found - true)[1:-1, 3:5] ** 2)) < 0.0003  # 0.00042
+
+
 def test_few_beams_show_roll_and_pitch() -> None:
     """Rings that are laid on those of the sweep before would follow the scanner instead of the ground."""
     rng, turns = np.random.default_rng(0), np.random.default_rng(1).normal(0.0, 0.004, (14, 2))
@@ -80,10 +103,31 @@ def test_motion_seems_later_the_further_what_is_seen_is_from_the_stamp(stream: S
 def test_points_are_moved_to_where_they_were_at_the_stamp() -> None:
     rng = np.random.default_rng(0)
     still, times = rng.uniform(-50, 50, (100, 3)), rng.uniform(-0.05, 0.05, 100)
-    velocity = np.array([15.0, 0.3, -0.2, 0.02, -0.03, 0.35])
-    T_mid_then = se3.matrix(times[:, None] * velocity)
-    seen = np.einsum("nij,nj->ni", se3.invert(T_mid_then)[:, :3, :3], still) + se3.invert(T_mid_then)[:, :3, 3]
-    assert np.abs(deskew(seen, times, velocity) - still).max() < 1e-3
+    velocity, change = np.array([15.0, 0.3, -0.2, 0.02, -0.03, 0.35]), np.array([3.0, 1.0, 0.5, 0.3, 0.4, 0.2])
+
+    def at(t: Array) -> Array:
+        """In many small motions, each in the axes of the one before."""
+        T = np.broadcast_to(np.eye(4), (len(t), 4, 4))
+        for k in range(200):
+            T = T @ se3.matrix(t[:, None] / 200 * (velocity + change * (k + 0.5) / 200 * t[:, None]))
+        return T
+
+    seen = np.einsum("nij,nj->ni", se3.invert(at(times))[:, :3, :3], still) + se3.invert(at(times))[:, :3, 3]
+    assert np.abs(deskew(seen, times, velocity, change) - still).max() < 1e-3
+    stamps = 0.1 * np.arange(9)
+    poses = at(stamps - 0.4)
+    found = derivatives(stamps, [*se3.relative(poses[:-1], poses[1:])])
+    assert np.allclose(found[0][4], velocity, atol=6e-3)
+    assert np.allclose(found[1][4, 3:], change[3:], atol=1e-3)
+
+
+def test_derivatives_where_steps_are_missing() -> None:
+    step = np.array([1.0, 0, 0, 0, 0, 0.1])
+    steps = [se3.matrix(step) if k not in (3, 6, 7) else None for k in range(9)]
+    velocity, change = derivatives(0.1 * np.arange(10), steps)
+    assert [*np.flatnonzero(np.isnan(velocity[:, 0]))] == [7]
+    assert np.allclose(velocity[[0, 2, 3, 4, 6, 9]][:, 5], 1.0)
+    assert np.allclose(change[np.isfinite(change)], 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("step", [[3.0, 0.05, 0.0, 0.002, 0.004, 0.09], [0.0] * 6, [-1.0, 0, 0, 0, 0, -0.03]])
@@ -112,7 +156,7 @@ def test_paper_minimum_is_an_option(stream: Stream, motions: Motions) -> None:
 
 def test_jacobian_is_the_derivative(motions: Motions, stream: Stream) -> None:
     a, b = (registration.surface(s.points.astype(float), 0.5) for s in stream.readings[:2])
-    at = registration.plane_residuals(a, b, se3.matrix(motions.vec[0]), 0.2)
+    at = registration.plane_residuals(a, b.points, se3.matrix(motions.vec[0]), 0.2)
 
     def errors(vec: Array) -> Array:
         T = se3.matrix(vec)
@@ -129,7 +173,7 @@ def test_covariance_is_that_of_range_noise(motions: Motions, stream: Stream) -> 
     """Against brute force: the minimum recomputed under noise of every range, matches and normals kept."""
     a, b = (registration.surface(s.points.astype(float), 0.5) for s in stream.readings[:2])
     T = registration.point_to_plane(a, b, se3.matrix(motions.vec[0]), 0.2, iterations=10)
-    at = registration.plane_residuals(a, b, T, 0.2)
+    at = registration.plane_residuals(a, b.points, T, 0.2)
     claimed = registration.range_covariance(at, 0.01, 3.0)
     rng = np.random.default_rng(3)
     A, R = at.jacobian, T[:3, :3]

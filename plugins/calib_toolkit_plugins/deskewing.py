@@ -1,0 +1,106 @@
+"""How a scanner moved within a sweep: foreseen from the steps between sweeps, then as the sweep itself shows it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from calib_toolkit import se3
+from calib_toolkit_plugins import registration
+from calib_toolkit_plugins.registration import Surface
+
+Array = NDArray[np.float64]
+
+SHAKES = np.repeat([0.002, 0.0005], 3)
+"""Metres and radians by which a vehicle shakes within half a sweep, beyond what the steps foresee: sigma. Wider ones
+let sweeps of few beams bend as they like."""
+OFF = 10 * SHAKES
+"""Sigma of the pose of a sweep that was straightened by the steps alone: where it shows nothing, it stays."""
+
+
+def deskew(points: Array, times: Array, velocity: Array, change: Array | None = None) -> Array:
+    """Points, each as measured, moved to where the scanner was at the stamp (paper V-A).
+
+    points: (n, 3) metres. times: (n,) seconds from the stamp. velocity: (6,) metres and radians a second at the
+    stamp, axes of the scanner, which turn with it; change: (6,) by how much that changes per second, none by
+    default. All to second order in the time since the stamp: under a millimetre at 50 m and 20 degrees/s.
+    """
+    turn, t = se3.skew(velocity[3:]), times[:, None]
+    faster, bend = turn @ velocity[:3], turn @ turn
+    if change is not None:
+        faster, bend = faster + change[:3], bend + se3.skew(change[3:])
+    return points + t * (points @ turn.T + velocity[:3] + (0.5 * t) * (points @ bend.T + faster))
+
+
+def derivatives(stamps: Array, steps: Sequence[Array | None]) -> tuple[Array, Array]:
+    """Velocity and its change, both (n, 6) as :func:`deskew` takes them, at each of n stamps, seconds.
+
+    steps: ``T_prev_curr`` (4, 4) between them, None where unknown. Of the four steps around a stamp these are the
+    derivatives of the quartic through their ends; where one is missing, the mean of those beside it and no change;
+    nan where both are. How travel changes is not told by travel: along a bare street that would be noise, which the
+    next pass would add to. It is what goes with changes of the turn rate all along the drive: a scanner swings on its
+    mast when the vehicle rolls and pitches.
+    """
+    dt = np.diff(stamps)[:, None]
+    vec = np.array([np.full(6, np.nan) if T is None else se3.vector(T) for T in steps])
+    even = vec / dt
+    even[:, :3] = np.linalg.solve(se3.left_jacobian(vec[:, 3:]), even[:, :3, None])[:, :, 0]
+    around = sliding_window_view(np.pad(even, ((2, 2), (0, 0)), constant_values=np.nan), 4, axis=0)
+    velocity, change = around @ [-1, 7, 7, -1] / 12, around @ [1, -15, 15, -1] / 12 / np.median(dt)
+    known, beside = np.isfinite(change[:, :1]), np.isfinite(around[:, :, 1:3])
+    either = np.sum(around[:, :, 1:3], axis=2, where=beside) / np.where(
+        np.any(beside, axis=2), beside.sum(axis=2), np.nan
+    )
+    change[:, :3] = change[:, 3:] @ _swing(around[known[:, 0]] @ [-1, -1, 1, 1])
+    return np.where(known, velocity, either), np.where(known, change, 0.0)
+
+
+def _swing(changes: Array) -> Array:
+    """(3, 3) by which changes of turns (n, 3) become changes of travel, of (n, 6) of both."""
+    size = np.abs(changes)
+    usual = np.all(size <= 6 * np.median(size, axis=0), axis=1) if len(size) else size[:, 0] > 0
+    return np.asarray(np.linalg.lstsq(changes[usual, 3:], changes[usual, :3])[0])
+
+
+def settled(
+    prev: Surface, points: Array, times: Array, T_prev_curr: Array, cell: float, gate: float
+) -> tuple[Array, Array]:
+    """``T_prev_curr`` (4, 4) of a sweep that may have shaken while it was measured, and points of it, one a ``cell``.
+
+    Least squares over point-to-plane distances below ``gate`` metres, Geman and McClure's weights, in the pose and in
+    what the motion lacks within the sweep, to second order in time. points: (n, 3) metres, moved to the stamp as far
+    as is known; times: (n,) seconds from it. They are taken as they were measured, and no means of cells: those lie
+    on a grid that comes along with the scanner, and hide some hundredths of its swing.
+    """
+    taken, half = _middles(points, times, cell), np.abs(times).max()
+    p, order = points[taken], (times[taken, None] / max(half, 1e-9)) ** np.arange(3)
+    stiff = np.concatenate([OFF, SHAKES, SHAKES]) ** -2
+    x, R = np.zeros((3, 6)), T_prev_curr[:3, :3]
+    for _ in range(2):
+        there = registration.plane_residuals(prev, _moved(p, order @ x), T_prev_curr, gate)
+        if len(there.errors) < stiff.size:
+            break
+        sigma = 1.4826 * np.median(np.abs(there.errors)) + 1e-6
+        weight = (1 + (there.errors / (2 * sigma)) ** 2) ** -2 / sigma**2
+        normals = there.normals @ R
+        by_pose = np.hstack([normals, np.cross(there.points, normals)])
+        J = (order[there.rows, :, None] * by_pose[:, None, :]).reshape(-1, stiff.size)
+        gradient = J.T @ (there.errors * weight) + stiff * x.ravel()
+        x -= np.linalg.solve(J.T @ (J * weight[:, None]) + np.diag(stiff), gradient).reshape(x.shape)
+    T = se3.matrix(x[0])
+    back = se3.invert(T)
+    return T_prev_curr @ T, _moved(p, order @ x) @ back[:3, :3].T + back[:3, 3]
+
+
+def _moved(points: Array, by: Array) -> Array:
+    """Points moved by small motions, both (n, 3) and (n, 6)."""
+    return points + by[:, :3] + np.cross(by[:, 3:], points)
+
+
+def _middles(points: Array, times: Array, cell: float) -> NDArray[np.int64]:
+    """Rows of points (n, 3), one of each cell: that in the middle of it by time, so that none is early or late."""
+    cells = np.floor(points / cell).astype(np.int64) @ np.array([1, 1 << 20, 1 << 40])
+    order = np.lexsort((times, cells))
+    start = np.flatnonzero(np.diff(cells[order], prepend=cells[order[0]] - 1))
+    return np.asarray(order[(start + np.append(start[1:], len(order))) // 2])
