@@ -48,10 +48,9 @@ def derivatives(stamps: Array, steps: Sequence[Array | None]) -> tuple[Array, Ar
     even[:, :3] = np.linalg.solve(se3.left_jacobian(vec[:, 3:]), even[:, :3, None])[:, :, 0]
     around = sliding_window_view(np.pad(even, ((2, 2), (0, 0)), constant_values=np.nan), 4, axis=0)
     velocity, change = around @ [-1, 7, 7, -1] / 12, around @ [1, -15, 15, -1] / 12 / np.median(dt)
-    known, beside = np.isfinite(change[:, :1]), np.isfinite(around[:, :, 1:3])
-    either = np.sum(around[:, :, 1:3], axis=2, where=beside) / np.where(
-        np.any(beside, axis=2), beside.sum(axis=2), np.nan
-    )
+    before, after = around[:, :, 1], around[:, :, 2]
+    either = (np.where(np.isnan(before), after, before) + np.where(np.isnan(after), before, after)) / 2
+    known = np.isfinite(change[:, :1])
     change[:, :3] = change[:, 3:] @ _swing(around[known[:, 0]] @ [-1, -1, 1, 1])
     return np.where(known, velocity, either), np.where(known, change, 0.0)
 
