@@ -69,10 +69,9 @@ def settled(
 
     Least squares over point-to-plane distances below ``gate`` metres, Geman and McClure's weights, in the pose and in
     what the motion lacks within the sweep, to second order in time. points: (n, 3) metres, moved to the stamp as far
-    as is known; times: (n,) seconds from it. They are taken as they were measured, and no means of cells: those lie
-    on a grid that comes along with the scanner, and hide some hundredths of its swing.
+    as is known; times: (n,) seconds from it.
     """
-    taken, half = _middles(points, times, cell), np.abs(times).max()
+    taken, half = registration.picked(points, times, cell), np.abs(times).max()
     p, order = points[taken], (times[taken, None] / max(half, 1e-9)) ** np.arange(3)
     stiff = np.concatenate([OFF, SHAKES, SHAKES]) ** -2
     x, R = np.zeros((3, 6)), T_prev_curr[:3, :3]
@@ -95,11 +94,3 @@ def settled(
 def _moved(points: Array, by: Array) -> Array:
     """Points moved by small motions, both (n, 3) and (n, 6)."""
     return points + by[:, :3] + np.cross(by[:, 3:], points)
-
-
-def _middles(points: Array, times: Array, cell: float) -> NDArray[np.int64]:
-    """Rows of points (n, 3), one of each cell: that in the middle of it by time, so that none is early or late."""
-    cells = np.floor(points / cell).astype(np.int64) @ np.array([1, 1 << 20, 1 << 40])
-    order = np.lexsort((times, cells))
-    start = np.flatnonzero(np.diff(cells[order], prepend=cells[order[0]] - 1))
-    return np.asarray(order[(start + np.append(start[1:], len(order))) // 2])

@@ -24,6 +24,8 @@ GATES = (1.5, 1.0, 0.5, 0.3)
 ROUNDS = 30
 ENOUGH = 0.1
 """Sigmas: a smaller step than this ends the search."""
+SHORTEST = 0.125
+"""Of a step, the least part that is taken."""
 FIRST_RUNS = 8
 """Runs of scans that find the mount along which all others are straightened; with fewer in all, none is found."""
 START = np.repeat([0.02, np.radians(0.1)], 3)
@@ -36,9 +38,6 @@ UNSEEN, FAR = 10.0, 10.0
 """Sigma of what is not seen, metres; a rotation counts as what it moves at the distance ``FAR``."""
 MATCHING = np.repeat([1e-3, np.radians(0.01)], 3)
 """Sigma of what matching errs in all scans alike (metres, radians): no number of runs averages it away."""
-SAGGING = 0.015
-"""Sigma (metres) of what it errs along the axis about which a path turns most, an upright one. Only roll and pitch
-tell the mount there, of which rings on the ground hide a little (with true paths 12 to 20 mm; elsewhere one)."""
 TOGETHER = 8.0
 """Seconds within which runs have errors in common: scans, or the path between them."""
 FEWEST = 3.0
@@ -54,7 +53,7 @@ class Map:
 
     id = "map"
     options: type = NoOptions
-    version = "5"
+    version = "6"
 
     def accepts(self, kind_a: str, kind_b: str) -> bool:
         """Whether one is a lidar, and the other a lidar or a sensor of poses."""
@@ -140,15 +139,19 @@ def _search(
 ) -> tuple[State, Equations, bool, float]:
     """Matches points and steps in turn, until steps are small; and whether they became so.
 
-    The motion stage's mount steers along what is hardly seen. Returns the equations there without it.
+    The motion stage's mount steers along what is hardly seen. Points that change their match back and forth would
+    turn steps round for ever, so each that goes back is half as long. Returns the equations there without the mount.
     """
-    gates = list(gates)
+    gates, before, length = list(gates), np.zeros(6), 1.0
     prior = np.linalg.inv(problem.cov)
     for round_ in range(ROUNDS):
         information, gradient, rms = _misfits(problem, surfaces, state, gates[min(round_, len(gates) - 1)])
         found = equations(state, problem.links, information, gradient)
         steered = found.information + prior
         step = np.asarray(-np.linalg.solve(steered, found.gradient + prior @ _step(problem.T, state.T)), dtype=float)
+        if step @ steered @ before < 0:
+            length = max(length / 2, SHORTEST)
+        step = before = length * step
         if round_ >= len(gates) + 1 and step @ steered @ step < ENOUGH**2:
             return state, found, True, rms
         state = moved(state, problem.links, found, step)
@@ -180,10 +183,6 @@ def _without_prior(problem: Problem, state: State, found: Equations) -> tuple[Ar
     T = stepped(state.T, -seen / kept @ seen.T @ found.gradient)
     turned = np.vstack([-se3.skew(T[:3, 3]), np.eye(3)])
     lasting = turned @ problem.attitude @ turned.T + np.diag(MATCHING**2)
-    if problem.links.one_mount:
-        turns = se3.log_so3(problem.links.T_path[:, :3, :3])
-        upright = np.linalg.eigh(turns.T @ turns)[1][:, -1]
-        lasting[:3, :3] += SAGGING**2 * np.outer(upright, upright)
     return T, _jackknife(found, seen, kept) + UNSEEN**2 * unseen @ unseen.T + lasting
 
 

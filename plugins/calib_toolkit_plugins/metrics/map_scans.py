@@ -116,7 +116,8 @@ def straighten(sweep: Sweep, motion: Motions, T_path_lidar: Array) -> Patch | No
     before, after = (
         np.einsum("nij,nj->ni", T[i, :3, :3], sweep.points.astype(np.float64)) + T[i, :3, 3] for i in (k, k + 1)
     )
-    return _planes(registration.thinned((1 - part) * before + part * after, CELL))
+    straight = (1 - part) * before + part * after
+    return _planes(straight[registration.picked(straight, sweep.times, CELL)])
 
 
 def _planes(points: Array) -> Patch:
