@@ -51,7 +51,7 @@ def thinned(points: Array, cell: float) -> Array:
 
 
 def picked(points: Array, times: Array, cell: float) -> NDArray[np.int64]:
-    """(m,) rows of points (n, 3), one of each ``cell`` metres: that in the middle of it by time (n,).
+    """(m,) rows of points (n, 3), one of each ``cell`` metres: that in the middle by time (n,), of two the later.
 
     Where a scanner swings by millimetres, means of cells would hide some hundredths of that: the cells come along.
     """

@@ -40,7 +40,7 @@ class VelodyneOptions:
     max_jump: how far a step may be from the one before it; also the sigma of what the surroundings do not show.
     min_overlap: share of a sweep that must lie on the surfaces of the sweep before. min_points: with fewer left
     of it, a sweep is not used. deskew: move points to where the scanner was at the stamp. point_to_plane: answer
-    with the paper's point-to-plane minimum instead of the plane-to-plane one, which is the more accurate.
+    with the paper's point-to-plane minimum instead of the plane-to-plane one, settled within the sweep.
     """
 
     min_range: float = 2.0
@@ -58,7 +58,7 @@ class VelodyneOptions:
 @hookimpl
 def calib_register_sensors() -> list[Sensor]:
     """The ``velodyne`` sensor."""
-    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="12")]
+    return [Sensor(id="velodyne", estimate=estimate, options=VelodyneOptions, open_table=open_table, version="13")]
 
 
 def estimate(stream: Stream, options: VelodyneOptions) -> Motions:
@@ -220,7 +220,10 @@ def _again(stream: Stream, how: _Pass, first: list[_Step]) -> list[_Step]:
 
 
 def _laid(clouds: Sequence[Array], sweep: _Sweep, T_seed: Array, how: _Pass) -> tuple[_Step, Array]:
-    """The step from the frame of the clouds to a sweep's, and points (m, 3) of the sweep."""
+    """The step from the frame of the clouds to a sweep's, and points (m, 3) of the sweep.
+
+    Its covariance is always that of the pose alone, before what shook within the sweep is looked for.
+    """
     options = how.options
     onto, curr = registration.surface(np.concatenate(clouds), options.cell), sweep.surface
     step = _step(onto, curr, T_seed, options)

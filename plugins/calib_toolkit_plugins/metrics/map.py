@@ -53,7 +53,7 @@ class Map:
 
     id = "map"
     options: type = NoOptions
-    version = "6"
+    version = "7"
 
     def accepts(self, kind_a: str, kind_b: str) -> bool:
         """Whether one is a lidar, and the other a lidar or a sensor of poses."""
@@ -140,7 +140,8 @@ def _search(
     """Matches points and steps in turn, until steps are small; and whether they became so.
 
     The motion stage's mount steers along what is hardly seen. Points that change their match back and forth would
-    turn steps round for ever, so each that goes back is half as long. Returns the equations there without the mount.
+    turn steps round for ever, so from the first that goes back on they are half as long, and so on down to the
+    ``SHORTEST``, with which it is enough that they are short. Returns the equations there without the mount's.
     """
     gates, before, length = list(gates), np.zeros(6), 1.0
     prior = np.linalg.inv(problem.cov)
@@ -149,10 +150,11 @@ def _search(
         found = equations(state, problem.links, information, gradient)
         steered = found.information + prior
         step = np.asarray(-np.linalg.solve(steered, found.gradient + prior @ _step(problem.T, state.T)), dtype=float)
-        if step @ steered @ before < 0:
+        if round_ >= len(gates) and step @ steered @ before < 0:
             length = max(length / 2, SHORTEST)
-        step = before = length * step
-        if round_ >= len(gates) + 1 and step @ steered @ step < ENOUGH**2:
+        before, step = step, length * step
+        told = step if length == SHORTEST else before
+        if round_ >= len(gates) + 1 and told @ steered @ told < ENOUGH**2:
             return state, found, True, rms
         state = moved(state, problem.links, found, step)
     return state, found, False, rms
