@@ -76,3 +76,16 @@ def test_stated_leans_in_base_axes():
     found = leaning.stated(stated, R)
     base, ins, odo = (r @ np.diag(m.lean**2) @ r.T for r, m in zip(R, stated, strict=True))
     assert_allclose(found, np.block([[ins + base, base], [base, odo + base]]))
+
+
+@pytest.mark.parametrize("lean", [0.1, 1e-4])
+def test_turns_are_tilted_as_travel_leans_but_across_it_by_little(lean):
+    motions = drive(path(10, 0, "street"), [SimulatedSensor(n, T) for n, T in MOUNTS.items()], 0)
+    stated = [replace(m, lean=np.full(3, lean)) for m in motions.values()]
+    R = np.array([T[:3, :3] for T in MOUNTS.values()])
+    found = leaning.tilted(stated, R, np.array([8.0, 0.0, 0.0]))
+    across = min(lean, leaning.TILT)
+    turns = np.diag([lean, across, across]) ** 2
+    assert_allclose(found[:3], 0.0)
+    assert_allclose(found[3:6, 3:6], 2 * turns, atol=1e-15)
+    assert_allclose(found[3:6, 9:12], turns, atol=1e-15)  # what the base has is shared

@@ -160,7 +160,7 @@ def _place(timed: Timed, known: Sequence[Measured]) -> Placed:
     poses, clock_cov = 6 * (len(names) - 1), timed.told.cov
     cov, moved = (by_found @ cov @ by_found.T)[:poses, :poses], (-by_found @ gain @ found.by_clock)[:poses]
     cov = cov + leaning.late(timed.motions, ahead / float(np.sum(np.diff(timed.steps.ends, axis=1))))
-    cov = cov + leaning.rolled(timed.motions, timed.turned.R_base_sensor, ahead)
+    cov = cov + leaning.tilted(timed.motions, timed.turned.R_base_sensor, ahead)
     joint = np.block([[cov + moved @ clock_cov @ moved.T, moved @ clock_cov], [clock_cov @ moved.T, clock_cov]])
     return Placed(T, joint, _unknown(timed, open_, joint), found)
 

@@ -1,6 +1,7 @@
 """Sensors whose travel is turned against their own turns, or late: which of the two to believe, and how far."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,9 @@ BIASED = 0.05
 """Radians by which travel may be turned about an axis about which they disagree."""
 MOST = float(np.radians(1.5))
 """Travel is never turned further than this: then it is the turns that are wrong."""
+TILT = float(np.radians(0.015))
+"""By which turns are tilted across travel, at most, where a sensor's travel leans: corners in images follow a turn
+a hundredth of a pixel wrong, all alike, and no number of them averages that away."""
 USUAL = float(np.radians(0.5))
 """Sigma of what travel is turned by, as far as recordings show, where the turns are no help to tell."""
 
@@ -45,15 +49,22 @@ def late(motions: Sequence[Motions], velocity: Array) -> Array:
     return np.asarray(block_diag(*others) + np.tile(base, (len(others), len(others))))
 
 
-def rolled(motions: Sequence[Motions], R: Array, ahead: Array) -> Array:
-    """(6(n-1), 6(n-1)) of poses: what leans travel turns the turns, too, about where the vehicle goes.
+def tilted(motions: Sequence[Motions], R: Array, ahead: Array) -> Array:
+    """(6(n-1), 6(n-1)) of poses: what leans travel tilts the turns, too: by as much about where the vehicle goes.
 
-    Across that, travel is told to lean already; about it, it tells nothing. Arguments as of :func:`stated`; ahead:
-    (3,) where the base went.
+    There travel tells nothing. Across that it is told to lean already, and the turns are, by up to ``TILT``.
+    Arguments as of :func:`stated`; ahead: (3,) where the base went.
     """
     about = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
-    only = np.kron(np.eye(len(motions) - 1), np.vstack([np.zeros((3, 3)), np.outer(about, about)]))
-    return np.asarray(only @ stated(motions, R) @ only.T)
+    along = np.outer(about, about)
+    least = [replace(m, lean=np.minimum(m.lean, TILT)) for m in motions]
+    return _of_poses(along, stated(motions, R)) + _of_poses(np.eye(3) - along, stated(least, R))
+
+
+def _of_poses(part: Array, cov: Array) -> Array:
+    """(6m, 6m) of poses from the part (3, 3) of each of m rotations whose covariance is (3m, 3m)."""
+    only = np.kron(np.eye(len(cov) // 3), np.vstack([np.zeros((3, 3)), part]))
+    return np.asarray(only @ cov @ only.T)
 
 
 def axes(
