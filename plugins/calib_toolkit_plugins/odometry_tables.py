@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 COLUMNS = {"tum": (8, 8), "euroc": (8, 17), "kitti": (12, 12), "csv": (7, 64)}
 """Fewest and most columns of each format's rows."""
 KEYS = ("poses", "format", "times", "has_scale", "motion_sigma", "sigmas")
+UNFIT = {"kitti": (), "csv": ("times", "sigmas")}
+"""Keys that would be of no use with a format; with those not named, times."""
 POSE, MOTION = ("x", "y", "z", "qx", "qy", "qz", "qw"), ("x", "y", "z", "rx", "ry", "rz")
 COV = [(i, j, f"cov_{a}_{b}") for i, a in enumerate(MOTION) for j, b in enumerate(MOTION) if i <= j]
 
@@ -35,6 +37,8 @@ def open_table(table: SensorTable) -> Log:
         raise DataError(f"sensor {name}: format = {style!r} is unknown; write one of {', '.join(COLUMNS)}")
     if not isinstance(has_scale, bool):
         raise DataError(f"sensor {name}: has_scale must be true or false, not {has_scale!r}")
+    if unfit := [key for key in UNFIT.get(style, ("times",)) if key in values]:
+        raise DataError(f"sensor {name}: {unfit[0]} does not go with format = '{style}'; remove it")
     if style == "csv":
         return _titled(table, tables.table_file(table, "poses"))
     rows = tables.read_rows(tables.table_file(table, "poses"), *COLUMNS[style])
@@ -110,16 +114,16 @@ def _titled(table: SensorTable, file: Path) -> Log:
     values = np.stack([columns[c] for c in kind], axis=1)
     cov = _covariances(columns)
     has_scale = table.values.get("has_scale", True)
-    if kind == MOTION:
-        return _motions(table.name, rows, ns, values, cov, has_scale, cut)
-    keep, notes = tables.usable_rows(ns, values, rows)
-    T = _poses("tum", np.column_stack([np.zeros(len(keep)), values[keep]]), [rows[i] for i in keep])
-    told = np.full((len(keep), 6, 6), np.nan) if cov is None else cov[keep]
-    readings = [PoseReading(p, c if np.isfinite(c).all() else None) for p, c in zip(T, told, strict=True)]
     options = {}
     if "motion_sigma" in table.values:
         sigma = six_sigmas(table.values["motion_sigma"], f"sensor {table.name}: motion_sigma")
         options["motion_sigma"] = tuple(sigma.tolist())
+    if kind == MOTION:
+        return _motions(table.name, rows, ns, values, cov, has_scale, options, cut)
+    keep, notes = tables.usable_rows(ns, values, rows)
+    T = _poses("tum", np.column_stack([np.zeros(len(keep)), values[keep]]), [rows[i] for i in keep])
+    told = np.full((len(keep), 6, 6), np.nan) if cov is None else cov[keep]
+    readings = [PoseReading(p, c if np.isfinite(c).all() else None) for p, c in zip(T, told, strict=True)]
     epoch_ns = int(ns[keep[0]])
     times = tables.seconds(ns[keep], epoch_ns)
     stream = Stream(table.name, "odometry", times, readings, None, has_scale, options=options, notes=cut + notes)
@@ -133,6 +137,7 @@ def _motions(
     vec: Array,
     cov: Array | None,
     has_scale: bool,
+    options: dict[str, tuple[float, ...]],
     notes: tuple[str, ...],
 ) -> Log:
     """Motions in a table; a row without numbers is one that failed. None between others may go: the chain breaks."""
@@ -146,7 +151,8 @@ def _motions(
         MotionReading(vec[k], None if cov is None else cov[k]) if usable[k] else MotionReading(None)
         for k in range(len(rows))
     ]
-    stream = Stream(name, "odometry", tables.seconds(ns, int(ns[0])), readings, None, has_scale, notes=notes)
+    stamps = tables.seconds(ns, int(ns[0]))
+    stream = Stream(name, "odometry", stamps, readings, None, has_scale, options=options, notes=notes)
     return Log(rows[0].file, {name: stream}, int(ns[0]))
 
 

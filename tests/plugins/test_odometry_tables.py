@@ -8,6 +8,7 @@ import pytest
 from odometry_files import SIGMA, opened, poses, written
 
 from calib_toolkit import DataError
+from calib_toolkit_plugins.odometry import OdometryOptions, estimate
 
 
 def test_rows_with_nan_or_a_stamp_that_goes_back_or_repeats_are_left_out_with_a_note(tmp_path: Path) -> None:
@@ -58,6 +59,15 @@ def test_a_table_with_titles_says_where_it_was_cut(tmp_path: Path, titles: str) 
     assert "poses.csv, line 6 has fewer columns than the line before it" in note
 
 
+def test_motions_without_covariances_have_the_stated_sigma(tmp_path: Path) -> None:
+    rows = [f"{k},1,0,0,0,0,1.25e-05" for k in range(12)]
+    (tmp_path / "motions.csv").write_text("\n".join(["stamp,x,y,z,rx,ry,rz", *rows]) + "\n")
+    stated = [0.1, 0.2, 0.3, 0.01, 0.02, 0.03]
+    stream = opened(tmp_path, {"poses": "motions.csv", "format": "csv", "motion_sigma": stated})
+    motions = estimate(stream, OdometryOptions(**stream.options))
+    assert np.allclose(motions.cov, np.diag(np.square(stated)))
+
+
 def test_one_stamp_that_leaps_ahead_costs_only_itself(tmp_path: Path) -> None:
     table = written(tmp_path, "tum", list(poses(30)))
     lines = (tmp_path / "poses.txt").read_text().splitlines()
@@ -93,6 +103,8 @@ def test_quaternions_close_to_unit_are_normalised_and_others_refused(tmp_path: P
         ({"motion_sigma": [0.1, 0.1, 0.1, 0, 0, 0]}, "motion_sigma must be six positive numbers"),
         ({"motion_sigma": "small"}, "motion_sigma must be six positive numbers"),
         ({"sigmas": "short.txt"}, "short.txt has 1 rows and .*poses.txt 20; give one each"),
+        ({"times": "short.txt"}, "times does not go with format = 'tum'; remove it"),
+        ({"format": "csv", "sigmas": "short.txt"}, "sigmas does not go with format = 'csv'; remove it"),
         ({"poze": "x"}, "has the key 'poze', which is unknown here; it may have poses, format"),
         ({"poses": "cut.txt"}, "cut.txt, line 2: 5 columns where 8 belong"),
         ({"poses": "words.txt"}, "words.txt, line 1: 'now' is not a stamp"),
