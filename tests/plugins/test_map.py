@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calib_toolkit import DataError, Motions, NoOptions, Pair, Scan, Stream, Trajectory, Transform, se3
+from calib_toolkit_plugins.metrics import map as map_
 from calib_toolkit_plugins.metrics.map import Map
 from calib_toolkit_plugins.metrics.map_scans import Sweep, misfit, straighten
 
@@ -177,6 +178,16 @@ def test_an_error_of_the_clock_moves_the_estimate_as_it_says(bumpy):
     weighed = np.linalg.cholesky(np.linalg.inv(found.transform.cov)).T
     assert np.linalg.norm(weighed @ moved) > 3.0
     assert np.linalg.norm(weighed @ (moved - 4e-3 * found.by_clock)) < 0.4 * np.linalg.norm(weighed @ moved)
+
+
+def test_a_search_that_runs_out_of_rounds_says_so_and_is_as_near_as_it_got(bumpy, monkeypatch):
+    pair, found = bumpy
+    monkeypatch.setattr(map_, "ROUNDS", 6)
+    stopped = Map().estimate(pair, NoOptions())
+    assert not stopped.converged
+    assert stopped.note == "its search did not come to rest within 6 rounds"
+    off = error(stopped.transform, found.transform.T_a_b)
+    assert np.all(np.abs(off) < 0.5 * np.sqrt(np.diag(found.transform.cov)))
 
 
 def test_a_plane_leaves_the_height_open_and_the_prior_does_not_fill_it():

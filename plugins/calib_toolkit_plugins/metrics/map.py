@@ -53,7 +53,7 @@ class Map:
 
     id = "map"
     options: type = NoOptions
-    version = "7"
+    version = "8"
 
     def accepts(self, kind_a: str, kind_b: str) -> bool:
         """Whether one is a lidar, and the other a lidar or a sensor of poses."""
@@ -101,6 +101,7 @@ class Map:
             return _refused(pair, f"scans have surfaces in common in {shown} places only, and it takes {FIRST_RUNS}")
         T, cov = _without_prior(problem, state, found)
         late = replace(problem, links=replace(problem.links, T_path=problem.links.T_late))
+        # a clock errs by a tenth of LATE or so: here a search that comes to no rest is near enough
         T_late, _ = _without_prior(late, *_search(late, surfaces, state, GATES[-1:])[:2])
         by_clock = _step(T, T_late) / LATE
         if problem.inverted:
@@ -141,9 +142,10 @@ def _search(
 
     The motion stage's mount steers along what is hardly seen. Points that change their match back and forth would
     turn steps round for ever, so from the first that goes back on they are half as long, and so on down to the
-    ``SHORTEST``, with which it is enough that they are short. Returns the equations there without the mount's.
+    ``SHORTEST``, with which it is enough that they are short. Returns the last state whose equations are known,
+    those equations without the motion's prior on the mount, whether steps became small, and ``_misfits``' distance.
     """
-    gates, before, length = list(gates), np.zeros(6), 1.0
+    gates, before, length, last = list(gates), np.zeros(6), 1.0, state
     prior = np.linalg.inv(problem.cov)
     for round_ in range(ROUNDS):
         information, gradient, rms = _misfits(problem, surfaces, state, gates[min(round_, len(gates) - 1)])
@@ -156,12 +158,12 @@ def _search(
         told = step if length == SHORTEST else before
         if round_ >= len(gates) + 1 and told @ steered @ told < ENOUGH**2:
             return state, found, True, rms
-        state = moved(state, problem.links, found, step)
-    return state, found, False, rms
+        last, state = state, moved(state, problem.links, found, step)
+    return last, found, False, rms
 
 
 def _misfits(problem: Problem, surfaces: Surfaces, state: State, gate: float) -> tuple[Array, Array, float]:
-    """``Misfit`` of every link, zero where two scans share nothing, and the root mean square distance."""
+    """``Misfit`` of every link, zero where two scans share nothing, and the links' median distance (rms), metres."""
     information, gradient = np.zeros((len(problem.links), 6, 6)), np.zeros((len(problem.links), 6))
     rms = []
     for i, ((a, b), T) in enumerate(zip(problem.scans(), state.targets_sources(problem.links), strict=True)):

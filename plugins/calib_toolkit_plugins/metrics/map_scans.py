@@ -99,7 +99,8 @@ def read_sweep(track: Track, k: int) -> Sweep | None:
     times = np.zeros(len(points)) if scan.times is None else np.asarray(scan.times, dtype=np.float64)
     squared = np.einsum("ij,ij->i", points, points)
     usable = np.flatnonzero((squared > NEAREST**2) & (squared < FARTHEST**2) & np.isfinite(times))
-    usable = usable[:: max(1, -(-len(usable) // POINTS))]
+    # an odd step meets all beams of an even number
+    usable = usable[:: -(-len(usable) // POINTS) | 1]
     return Sweep(points[usable], stamp + times[usable], stamp) if len(usable) >= FEWEST else None
 
 
