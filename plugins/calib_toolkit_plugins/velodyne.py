@@ -37,10 +37,11 @@ class VelodyneOptions:
     cell: one point is kept of each cell of this size. gate: farthest match at the end, and largest
     point-to-plane residual (the paper's 0.2 m).
     range_sigma: noise along the beam from which the covariance follows (the paper's 0.1 m).
-    max_jump: how far a step may be from the one before it; also the sigma of what the surroundings do not show.
-    min_overlap: share of a sweep that must lie on the surfaces of the sweep before. min_points: with fewer left
-    of it, a sweep is not used. deskew: move points to where the scanner was at the stamp. point_to_plane: answer
-    with the paper's point-to-plane minimum instead of the plane-to-plane one, settled within the sweep.
+    max_jump: how far a step may be from what was foreseen (in the first pass the step before it); also the sigma
+    of what the surroundings do not show. min_overlap: share of a sweep that must lie on the surfaces of the last
+    few. min_points: with fewer left of it, a sweep is not used. deskew: move points to where the scanner was at the
+    stamp. point_to_plane: answer with the paper's point-to-plane minimum instead of the plane-to-plane one, settled
+    within the sweep.
     """
 
     min_range: float = 2.0
@@ -67,8 +68,9 @@ def estimate(stream: Stream, options: VelodyneOptions) -> Motions:
     Each sweep is laid on the last few. In the first pass, a coarse one, the previous motion is the first guess and
     moves the points of a sweep to its stamp, as in the paper. But roll and pitch change within a sweep, which would
     hide some hundredths of them: the other two, coarse and fine, move the points as the steps before and after say,
-    changes of the turn rate included, and the last finds what else the vehicle shook (:mod:`deskewing`). A step that
-    fails (too few points, too little overlap, a jump) is left out.
+    changes of the turn rate included, and the last finds what else the vehicle shook (:mod:`deskewing`).
+    Without times of points there are two passes, both fine, and no point is moved. A step that fails (too few
+    points, too little overlap, a jump) is left out.
     Raises DataError with fewer than two readings, or one that is not a scan.
     """
     if len(stream) < 2:

@@ -63,7 +63,7 @@ class Chain:
 class Steps:
     """All sensors' motions over common steps.
 
-    stamps: (m + 1,) seconds in base time, or the (m, 2) ends of each step. vec: (n, m, 6); cov: (n, m, 6, 6);
+    ends: (m, 2) seconds in base time, start and end of each step. vec: (n, m, 6); cov: (n, m, 6, 6);
     has_scale: (n,); rejected: how many steps were dropped because the sensors' angles disagreed.
     """
 

@@ -47,8 +47,8 @@ def check(
     """Tell whether moving a sensor a little would make CALIBRATION.json fit DRIVE better.
 
     The file may come from anywhere: it needs base and, of each sensor, T_base_sensor; a clock offset that is null or
-    missing is estimated from the drive. Every installed metric looks at every pair of sensors that see the same
-    place, at moments that run would not choose.
+    missing is estimated from the drive. The metrics of the configuration (im, matching and map by default) and
+    those of --plugin look at every pair of sensors that see the same place, at moments that run would not choose.
 
     Exit status 0 if nothing better was found; 3 if a move would fit better or something could not be judged; 1 if
     there is nothing to check, with the reason.

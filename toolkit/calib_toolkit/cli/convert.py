@@ -44,8 +44,8 @@ def convert(
 ) -> None:
     """Write the recording SRC as DST in another format.
 
-    DST is there once all of it is, and never before; a call that was stopped goes on if it is made again (not for
-    bags). Exit status 3 if something was not written; it is listed.
+    DST is there once all of it is, and never before; a call that was stopped goes on if it is made again (to rig
+    and kitti-raw; other formats begin anew). Exit status 3 if something was not written; it is listed.
     """
     from calib_toolkit.cli.bars import bars
     from calib_toolkit.cli.chosen import sensor_names

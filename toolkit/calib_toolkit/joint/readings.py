@@ -11,7 +11,8 @@ from calib_toolkit.types import Motions
 Array = NDArray[np.float64]
 
 OFTEN = 0.05
-"""Seconds below which the readings of a sensor with scale are joined: their errors are hardly independent."""
+"""Seconds that joined readings of a sensor with scale last, where two or more fit: errors of shorter ones are hardly
+independent."""
 
 
 WIDENED = 2.0
@@ -19,7 +20,7 @@ WIDENED = 2.0
 
 
 def ready(motions: Motions) -> Motions:
-    """In order of time; those of a sensor that is read at over 20 Hz joined, as many as make a twentieth second."""
+    """In order of time; those of a sensor read at some 30 Hz or more joined, as many as make a twentieth second."""
     m = motions[np.argsort(motions.start, kind="stable")]
     period = float(np.median(m.end - m.start))
     together = round(OFTEN / max(period, 1e-4))

@@ -1,4 +1,4 @@
-"""Where the search begins: offsets from a minute early to a minute late, and any mounting, without a guess.
+"""Where the search begins: offsets from a minute and a half early to as much late, and any mounting, without a guess.
 
 Offsets are the lags at which two sensors' angular speeds go together; of the best few that one is taken at which
 some rotation makes the turns themselves agree. Poses are then least squares on common steps: rotations from turns
@@ -61,8 +61,8 @@ def agree(names: Sequence[str], chains: Sequence[Chain]) -> None:
         if noise < MOVED and left > (AGREED_SHORT if short else AGREED):
             raise DataError(
                 f"the turns of {name} and {names[0]} do not go together at any clock offset within {MOST_LATE:g} s, "
-                "or for too short a time; check that both are of one drive, have half of it in common, and count "
-                "their seconds from the same epoch"
+                "or for too short a time; check that both are of one drive, have three quarters of it in common, "
+                "and count their seconds from the same epoch"
             )
 
 
