@@ -79,6 +79,7 @@ def register(prev: Surface, curr: Surface, T_seed: Array, levels: Sequence[float
     """
     import small_gicp
 
+    # small_gicp stops at steps below 0.1 degrees and 1 mm: tighter takes 15 % longer, and steps err by as much
     T = T_seed
     for cell in levels:
         cells = small_gicp.GaussianVoxelMap(cell)
