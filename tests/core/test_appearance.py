@@ -157,6 +157,28 @@ def test_what_the_motion_leaves_open_appearance_must_tell(seen):
     assert ("leaves the pose open" in found.note) != seen
 
 
+class Two(Bowl):
+    """Fits as well a metre and a half aside."""
+
+    def prepare(self, pair, options):
+        draws = np.random.default_rng([self.seed, int(pair.selected[0, 1])]).normal(size=(2, 6))
+        return draws * self.noise
+
+    def costs(self, T_a_b, moment):
+        aside = off(self.best, np.array([0, 0, 1.5, 0, 0, 0]))
+        fits = [bowl(T_a_b, best, m, self.shape) for best, m in zip((self.best, aside), moment, strict=True)]
+        return np.minimum(*fits)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_where_the_motion_leaves_it_open_a_second_answer_is_looked_for(seed):
+    wide = np.where(np.arange(6) == 2, 10.0, SIGMA)
+    assert search.estimate(Two(), pair_at(TRUE), None, seed).converged
+    found = search.estimate(Two(), pair_at(TRUE, sigma=wide), None, seed)
+    assert not found.converged
+    assert "leaves the pose open" in found.note
+
+
 def test_a_pose_far_from_the_motion_is_refused():
     found = search.estimate(Bowl(), pair_at(off(TRUE, np.array([1.5, 0, 0, 0, 0.3, 0.3]))), None)
     assert not found.converged

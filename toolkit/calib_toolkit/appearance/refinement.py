@@ -11,7 +11,7 @@ import numpy as np
 
 from calib_toolkit import cache
 from calib_toolkit.appearance.pairs import Comparison, Moved, comparisons
-from calib_toolkit.appearance.search import estimate
+from calib_toolkit.appearance.search import VERSION, estimate
 from calib_toolkit.combine import Combined, combine, combine_paper
 from calib_toolkit.config import Config
 from calib_toolkit.errors import CalibrationError, ConfigError
@@ -141,7 +141,9 @@ def _estimate(comparison: Comparison, chosen: Any, seed: int, folder: Path | Non
     metric, pair = comparison.metric, comparison.pair
     key = ""
     if folder is not None:
-        key = cache.key_of(metric.id, type(metric).__name__, getattr(metric, "version", "1"), chosen, seed, pair)
+        key = cache.key_of(
+            metric.id, type(metric).__name__, getattr(metric, "version", "1"), VERSION, chosen, seed, pair
+        )
         if (stored := cache.load_pair(folder, key)) is not None:
             return stored
     try:

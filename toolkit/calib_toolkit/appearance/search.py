@@ -19,10 +19,15 @@ from calib_toolkit.types import Pair, PairEstimate, Transform
 
 Array = NDArray[np.float64]
 
+VERSION = "2"
+"""Of the search that metrics share: to be raised when its answers change, so that pairs in the cache are made again."""
 LEAST = np.array([0.05] * 3 + [np.radians(0.5)] * 3)
 """Metres, radians: a search is never narrower than this, for a stated sigma may be too small."""
 MOST = np.array([0.5] * 3 + [np.radians(5.0)] * 3)
 """One sigma is never taken to be more: half of the range that is searched."""
+ASIDE, CLOSE = 2.0, 0.5
+"""Of these: where else searches start along what the motion leaves open, since its own pose means nothing there; and
+how much narrower than others they are, so that they stay."""
 TOLD = 0.5
 """Share of these within which appearance must tell by itself what the motion leaves open."""
 FAR = 4.0
@@ -73,25 +78,23 @@ def estimate(
         moments = prepared(metric, pair, options)
     if len(moments) < FEWEST:
         return _refused(metric, pair, f"only {len(moments)} of {len(pair)} moments have something to compare")
-    frame = whitened(pair.prior)
+    frame, untold = whitened(pair.prior), MOST[:, None] * _untold(pair.prior)
     try:
-        found = _searched(metric, moments, frame, seed)
+        found = _searched(metric, moments, frame, untold, seed)
     except np.linalg.LinAlgError:
         return _refused(metric, pair, "its cost has no least value near the motion's pose")
     if found is None:
         return _refused(metric, pair, "in too few moments do both see the same")
     if np.linalg.norm(found.posterior) > FAR:
         return _refused(metric, pair, "the best pose lies further from the motion's than its sigma allows")
+    cov = frame.L @ found.cov @ frame.L.T + np.diag(OWN**2)
+    if _open(pair.prior, cov):
+        return _refused(metric, pair, "the motion leaves the pose open, and what the two see does not tell it either")
     if found.apart > FAR / 2:
         return _refused(metric, pair, "two searches end far from each other")
     if found.clear < CLEAR:
         return _refused(metric, pair, "no pose fits better than others that the motion allows")
     statistics = {"moments": float(found.moments), "clear": found.clear, "cost": found.cost, "apart": found.apart}
-    cov = frame.L @ found.cov @ frame.L.T + np.diag(OWN**2)
-    if _open(pair.prior, cov):
-        return _refused(
-            metric, pair, "the motion leaves the pose open, and the best one is no sharper than what was searched"
-        )
     transform = Transform(pair.a.name, pair.b.name, frame.poses(found.z)[0], cov)
     return PairEstimate(metric.id, transform, _by_clock(pair), statistics=statistics)
 
@@ -125,43 +128,55 @@ def whitened(prior: Transform) -> Frame:
     return Frame(replace(prior, cov=cov), np.linalg.cholesky(cov))
 
 
+def _untold(prior: Transform) -> Array:
+    """(6, u) orthonormal directions, in units of ``MOST``, along which the motion allows more than is searched."""
+    values, axes = np.linalg.eigh(prior.cov / np.outer(MOST, MOST))
+    return np.asarray(axes[:, values > FAR])
+
+
 def _open(prior: Transform, cov: Array) -> bool:
     """Whether along something that the motion does not tell appearance, with cov (6, 6), does not either.
 
     There the answer lies where the search happened to be, or beyond: nothing holds a parabola that is nearly flat.
     """
-    values, axes = np.linalg.eigh(prior.cov / np.outer(MOST, MOST))
-    untold = axes[:, values > FAR]  # wider than all that is searched
+    untold = _untold(prior)
     found = untold.T @ (cov / np.outer(MOST, MOST)) @ untold
     return bool(np.linalg.eigvalsh(found).max(initial=0.0) > TOLD**2)
 
 
-def _searched(metric: CostMetric, moments: Sequence[Any], frame: Frame, seed: int) -> Evidence | None:
-    """From smooth to sharp, twice; what the sharpest tells of the best pose, the wider the less the two agree."""
-    ends = [_end(metric, moments, frame, z, seed + k) for k, z in enumerate(_starts(seed))]
+def _searched(metric: CostMetric, moments: Sequence[Any], frame: Frame, untold: Array, seed: int) -> Evidence | None:
+    """From smooth to sharp, from several starts; what the sharpest tells of the best pose, the wider the less they
+    agree. untold: (6, u) steps along what the motion leaves open."""
+    starts = enumerate(_starts(frame, untold, seed))
+    ends = [_end(metric, moments, frame, z, width, seed + k) for k, (z, width) in starts]
     reached = sorted((e for e in ends if e is not None), key=lambda e: float(e[0].mean()))
     if not reached:
         return None
-    (least_cost, z), (other_cost, other) = reached[0], reached[-1]
+    least_cost, z = reached[0]
     cost = focused(metric, moments, frame, z, NARROWER[-1], BLURS[-1])
     if cost is None:
         return None
     least = np.linalg.solve(frame.L, np.diag(PARABOLA))
     found = evidence(cost, z, least @ least.T, seed)
     # one that fits clearly worse is not another answer
-    apart = (found.posterior - other) * (_worse(other_cost, least_cost) < CLEAR)
+    others = [found.posterior - other for cost, other in reached[1:] if _worse(cost, least_cost) < CLEAR]
+    apart = max(others, key=lambda z: float(np.linalg.norm(z)), default=np.zeros(6))
     return replace(found, cov=found.cov + np.outer(apart, apart) / 2, apart=float(np.linalg.norm(apart)))
 
 
-def _starts(seed: int) -> Array:
-    """(2, 6) the motion's own pose, and one that it allows."""
-    return np.array([np.zeros(6), 0.7 * np.random.default_rng(seed).normal(size=6)])
+def _starts(frame: Frame, untold: Array, seed: int) -> list[tuple[Array, float]]:
+    """The motion's own pose, one that it allows, and both ways along what it leaves open; and how wide to search."""
+    aside = ASIDE * np.linalg.solve(frame.L, untold).T
+    near = np.vstack([np.zeros(6), 0.7 * np.random.default_rng(seed).normal(size=6)])
+    return [*((z, 1.0) for z in near), *((z, CLOSE) for z in (*aside, *-aside))]
 
 
-def _end(metric: CostMetric, moments: Sequence[Any], frame: Frame, z: Array, seed: int) -> tuple[Array, Array] | None:
+def _end(
+    metric: CostMetric, moments: Sequence[Any], frame: Frame, z: Array, width: float, seed: int
+) -> tuple[Array, Array] | None:
     """Costs (m,) and pose at which a search from z ends; None where too little can be compared."""
     value = np.zeros(0)
-    for blur, sigma, rounds in zip(BLURS, NARROWER, ROUNDS, strict=True):
+    for blur, sigma, rounds in zip(BLURS, width * np.array(NARROWER), ROUNDS, strict=True):
         cost = focused(metric, moments, frame, z, sigma, blur)
         if cost is None:
             return None
