@@ -20,7 +20,7 @@ from calib_toolkit.types import Pair, PairEstimate, Transform
 Array = NDArray[np.float64]
 
 VERSION = "2"
-"""Of the search that metrics share: to be raised when its answers change, so that pairs in the cache are made again."""
+"""Of the search that metrics share: to be raised when its answers change, so that no old ones come from the cache."""
 LEAST = np.array([0.05] * 3 + [np.radians(0.5)] * 3)
 """Metres, radians: a search is never narrower than this, for a stated sigma may be too small."""
 MOST = np.array([0.5] * 3 + [np.radians(5.0)] * 3)
