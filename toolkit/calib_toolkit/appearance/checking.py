@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from calib_toolkit import se3
 from calib_toolkit.appearance.pairs import Comparison, Moved, comparisons, select
 from calib_toolkit.appearance.refinement import chosen, options
-from calib_toolkit.appearance.search import BLURS, CLEAR, FEWEST, LEAST, OWN, Frame, estimate, focused, prepared
+from calib_toolkit.appearance.search import CLEAR, FEWEST, LEAST, OWN, SHARPEST, Frame, estimate, focused, prepared
 from calib_toolkit.config import Config
 from calib_toolkit.errors import CalibrationError
 from calib_toolkit.hookspecs import CostMetric
@@ -237,7 +237,7 @@ def _held_out(pair: Pair, config: Config) -> tuple[Pair, bool]:
 def _stepped(look: Look, metric: CostMetric, moments: Sequence[Any], given: Transform) -> Look:
     """The look with the costs of all steps, and of those on the way to the pose that was found."""
     frame = Frame(replace(given, cov=np.diag(LEAST**2)), np.diag(LEAST))
-    cost = focused(metric, moments, frame, np.zeros(6), 1.0, BLURS[-1])
+    cost = focused(metric, moments, frame, np.zeros(6), 1.0, SHARPEST[1])
     if cost is None:
         return look
     along = (STEPS[:, :, None] * np.eye(6)).reshape(-1, 6)

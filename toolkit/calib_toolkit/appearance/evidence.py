@@ -28,16 +28,15 @@ NOTHING = 1e2
 class Evidence:
     """z: (6,) and cov: (6, 6), whitened: of appearance alone. posterior: (6,) with the motion's estimate.
 
-    cost: there. clear: standard errors by which it is better there than a sigma of the motion away. moments: how many
-    were compared. apart: from where another search ended, in sigma of the motion.
+    costs: (m,) there, at each of the moments that were compared. clear: standard errors by which their mean is better
+    there than a sigma of the motion away. apart: from where another search ended, in sigma of the motion.
     """
 
     z: Array
     cov: Array
     posterior: Array
-    cost: float
+    costs: Array
     clear: float
-    moments: int
     apart: float = 0.0
 
 
@@ -69,7 +68,7 @@ def evidence(cost: Callable[[Array], Array], z: Array, least: Array, seed: int) 
     better = cost(posterior + rng.normal(size=(SAMPLES // 4, 6))).mean(axis=0) - here
     m = len(here)
     clear = float(better.mean() / (better.std(ddof=1) / np.sqrt(m) + 1e-12))
-    return Evidence(z, cov, posterior, float(here.mean()), clear, m)
+    return Evidence(z, cov, posterior, here, clear)
 
 
 def _parabola(step: Array, seen: Array) -> tuple[Array, Array]:

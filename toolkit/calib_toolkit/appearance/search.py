@@ -19,7 +19,7 @@ from calib_toolkit.types import Pair, PairEstimate, Transform
 
 Array = NDArray[np.float64]
 
-VERSION = "2"
+VERSION = "3"
 """Of the search that metrics share: to be raised when its answers change, so that no old ones come from the cache."""
 LEAST = np.array([0.05] * 3 + [np.radians(0.5)] * 3)
 """Metres, radians: a search is never narrower than this, for a stated sigma may be too small."""
@@ -32,16 +32,20 @@ TOLD = 0.5
 """Share of these within which appearance must tell by itself what the motion leaves open."""
 FAR = 4.0
 """Length of ``z`` beyond which the best pose is not believed."""
-BLURS = (2.0, 1.0, 0.5)
-NARROWER = (1.0, 0.5, 0.25)
+BLURS = (2.0, 1.0)
+NARROWER = (1.0, 0.5)
 """Sigma of the search at each of these, in those of the motion."""
-ROUNDS = (30, 20, 15)
+ROUNDS = (30, 20)
 POPULATION = 12
 DRAWS = 24
 PARABOLA = np.array([0.02] * 3 + [np.radians(0.1)] * 3)
 """Metres, radians: how far around the best pose the cost is looked at, at least."""
 OWN = np.array([0.015] * 3 + [np.radians(0.03)] * 3)
 """Metres, radians: by so much a metric is off on any drive (beams have a width, pictures an exposure)."""
+SHARPEST = (0.25, 0.5)
+"""Sigma, in those of the motion, and blur with which the cost is looked at in the end."""
+LOOKS = 5
+"""How often it is looked at anew, at most, until the pose moves by no more than its own sigma."""
 FEWEST = 8
 """Moments that must have something to compare."""
 CLEAR = 3.0
@@ -94,7 +98,12 @@ def estimate(
         return _refused(metric, pair, "two searches end far from each other")
     if found.clear < CLEAR:
         return _refused(metric, pair, "no pose fits better than others that the motion allows")
-    statistics = {"moments": float(found.moments), "clear": found.clear, "cost": found.cost, "apart": found.apart}
+    statistics = {
+        "moments": float(len(found.costs)),
+        "clear": found.clear,
+        "cost": float(found.costs.mean()),
+        "apart": found.apart,
+    }
     transform = Transform(pair.a.name, pair.b.name, frame.poses(found.z)[0], cov)
     return PairEstimate(metric.id, transform, _by_clock(pair), statistics=statistics)
 
@@ -149,18 +158,14 @@ def _searched(metric: CostMetric, moments: Sequence[Any], frame: Frame, untold: 
     agree. untold: (6, u) steps along what the motion leaves open."""
     starts = enumerate(_starts(frame, untold, seed))
     ends = [_end(metric, moments, frame, z, width, seed + k) for k, (z, width) in starts]
-    reached = sorted((e for e in ends if e is not None), key=lambda e: float(e[0].mean()))
+    told = [_told(metric, moments, frame, z, seed + k) for k, z in enumerate(ends) if z is not None]
+    reached = sorted((e for e in told if e is not None), key=lambda e: float(e.costs.mean()))
     if not reached:
         return None
-    least_cost, z = reached[0]
-    cost = focused(metric, moments, frame, z, NARROWER[-1], BLURS[-1])
-    if cost is None:
-        return None
-    least = np.linalg.solve(frame.L, np.diag(PARABOLA))
-    found = evidence(cost, z, least @ least.T, seed)
+    found, *others = reached
     # one that fits clearly worse is not another answer
-    others = [found.posterior - other for cost, other in reached[1:] if _worse(cost, least_cost) < CLEAR]
-    apart = max(others, key=lambda z: float(np.linalg.norm(z)), default=np.zeros(6))
+    rivals = [found.posterior - e.posterior for e in others if _worse(e.costs, found.costs) < CLEAR]
+    apart = max(rivals, key=lambda z: float(np.linalg.norm(z)), default=np.zeros(6))
     return replace(found, cov=found.cov + np.outer(apart, apart) / 2, apart=float(np.linalg.norm(apart)))
 
 
@@ -171,19 +176,33 @@ def _starts(frame: Frame, untold: Array, seed: int) -> list[tuple[Array, float]]
     return [*((z, 1.0) for z in near), *((z, CLOSE) for z in (*aside, *-aside))]
 
 
-def _end(
-    metric: CostMetric, moments: Sequence[Any], frame: Frame, z: Array, width: float, seed: int
-) -> tuple[Array, Array] | None:
-    """Costs (m,) and pose at which a search from z ends; None where too little can be compared."""
-    value = np.zeros(0)
+def _end(metric: CostMetric, moments: Sequence[Any], frame: Frame, z: Array, width: float, seed: int) -> Array | None:
+    """Where a search from z ends; None where too little can be compared."""
     for blur, sigma, rounds in zip(BLURS, width * np.array(NARROWER), ROUNDS, strict=True):
         cost = focused(metric, moments, frame, z, sigma, blur)
         if cost is None:
             return None
         z = _best(cost, z, sigma, rounds, seed)
-        value = cost(z[None])[0]
         del cost  # its pictures, before the next are made
-    return value, z
+    return z
+
+
+def _told(metric: CostMetric, moments: Sequence[Any], frame: Frame, z: Array, seed: int) -> Evidence | None:
+    """What the sharpest cost tells from z on, looked at anew from where it leads until it leads no further.
+
+    The valley may be narrow and long (along a straight road): few rounds of the search come to its bottom.
+    """
+    least, found = np.linalg.solve(frame.L, np.diag(PARABOLA)), None
+    for _ in range(LOOKS):
+        cost = focused(metric, moments, frame, z, *SHARPEST)
+        if cost is None:
+            return None
+        found = evidence(cost, z, least @ least.T, seed)
+        del cost
+        step, z = found.posterior - z, found.posterior
+        if step @ (np.linalg.inv(found.cov) + np.eye(6)) @ step < len(step):
+            break
+    return found
 
 
 def _worse(costs: Array, least: Array) -> float:
