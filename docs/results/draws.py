@@ -58,19 +58,18 @@ def main(recording: Path, sensors: str, out: Path | None, **chosen: Any) -> None
     if log.reference is None:
         raise click.BadParameter(f"{recording} has no reference to start from")
     reference = log.reference.between(a, b).T_a_b
-    draws = list(drawn(log, a, b, reference, **chosen))
+    draws = list(drawn(log, a, b, reference, late=log.reference.dt_between(a, b)[0], **chosen))
     options = ", ".join(f"{k} {v}" for k, v in chosen.items() if v is not None)
     tell(summary(draws, reference, f"{a} and {b} of {recording.name}: {options}"), out)
 
 
 def drawn(
-    log: Log, a: str, b: str, reference: Array, metric: str, draws: int, moments: int, frames: int, half: int | None,
-    shift: float, turn: float, off: float, seed: int,
+    log: Log, a: str, b: str, reference: Array, late: float, metric: str, draws: int, moments: int, frames: int,
+    half: int | None, shift: float, turn: float, off: float, seed: int,
 ) -> Sequence[Draw]:  # fmt: skip
-    """All draws of one recording."""
+    """All draws of one recording. late: seconds, added to b's stamps to get a's time."""
     moved = sensor_motions(log, Config(), registry(), Silent(), default_folder())
     motion = {n: moved[n].motion for n in (a, b)}
-    late = 0.0 if log.reference is None else float(np.diff(log.reference.dt_base_sensor).sum())
     selected = select(log.streams[a], log.streams[b], motion[a], late, frames, seed)
     selected = selected if half is None else selected[half::2]
     chosen, rng, found = registry().metrics[metric], np.random.default_rng(seed), []

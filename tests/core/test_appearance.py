@@ -124,10 +124,18 @@ def test_what_is_found_does_not_lean_on_the_motion():
     assert_allclose(np.diag(a.cov), np.diag(b.cov), rtol=0.3)
 
 
+def test_what_a_metric_is_off_by_on_any_drive_is_in_its_sigma():
+    class Leaning(Bowl):
+        own = (0.0, 0.0, 0.3, 0.0, 0.1, 0.0)
+
+    usual, leaning = (search.estimate(m, pair_at(TRUE), None).transform.cov for m in (Bowl(), Leaning()))
+    assert_allclose(leaning - usual, np.diag(np.square(Leaning.own) - np.square(Bowl.own)), atol=1e-12)
+
+
 @pytest.mark.long
 def test_sigmas_hold():
     """Errors squared over what is stated, of poses whose moments differ as much as real ones."""
-    own = np.diag(search.OWN**2)
+    own = np.diag(np.square(Bowl.own))
     noise = 5 * SIGMA
     values = []
     for seed in range(40):

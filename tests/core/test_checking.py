@@ -202,7 +202,20 @@ def look(metric, move, sigma=0.01):
     nothing = np.full(STEPS.shape, np.nan)
     cov = np.diag(np.broadcast_to(sigma, 6).astype(float) ** 2)
     way = np.full(checking.PARTS.shape, np.nan)
-    return Look(metric, "velo", "cam0", 25, True, np.nan, nothing, nothing, way, np.asarray(move, dtype=float), cov)
+    return Look(
+        metric,
+        "velo",
+        "cam0",
+        25,
+        True,
+        np.nan,
+        nothing,
+        nothing,
+        way,
+        np.asarray(move, dtype=float),
+        cov,
+        np.zeros(6),
+    )
 
 
 def test_a_way_along_a_valley_is_told_where_no_axis_alone_is():

@@ -7,6 +7,7 @@ registered alike, under the entry-point group ``calib_toolkit``. docs/write-a-pl
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import radians
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -97,6 +98,9 @@ class CostMetric(ABC):
     id: str
     options: type = NoOptions
     version: str = "1"
+    own: tuple[float, ...] = (0.015,) * 3 + (radians(0.03),) * 3
+    """(6,) of ``(dt, delta)``, metres and radians, axes of a: by so much (sigma) its best pose is off on any drive,
+    for beams have a width and pictures an exposure. It is part of every covariance."""
 
     @abstractmethod
     def accepts(self, kind_a: str, kind_b: str) -> bool:

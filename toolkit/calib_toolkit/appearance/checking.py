@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from calib_toolkit import se3
 from calib_toolkit.appearance.pairs import Comparison, Moved, comparisons, select
 from calib_toolkit.appearance.refinement import chosen, options
-from calib_toolkit.appearance.search import CLEAR, FEWEST, LEAST, OWN, SHARPEST, Frame, estimate, focused, prepared
+from calib_toolkit.appearance.search import CLEAR, FEWEST, LEAST, SHARPEST, Frame, estimate, focused, prepared
 from calib_toolkit.config import Config
 from calib_toolkit.errors import CalibrationError
 from calib_toolkit.hookspecs import CostMetric
@@ -32,8 +32,8 @@ Array = NDArray[np.float64]
 TASK = "check"
 STEPS = np.array([-1.0, -0.5, -0.2, 0.2, 0.5, 1.0])[:, None] * np.array([0.1] * 3 + [np.radians(0.5)] * 3)
 """(s, 6) metres, radians: how far a pose is moved along each axis."""
-TRUSTED = np.abs(STEPS) >= 3 * OWN
-"""Steps of which more than half is beyond what a metric is off on any drive."""
+BEYOND = 3.0
+"""Times what a metric is off on any drive: of longer steps more than half is beyond that."""
 SHOWN = np.array([0.05] * 3 + [np.radians(0.25)] * 3)
 """Sigma up to which a metric shows an axis: the longest step is two of them."""
 AROUND = np.array([0.1] * 3 + [np.radians(1.0)] * 3)
@@ -56,7 +56,8 @@ class Look:
     costs, gain: (s, 6) of the ``STEPS``, the mean cost and by how many standard errors it is lower than ``cost``,
     that of the given pose; nan for a metric that only says what it finds. move, cov: (6,) and (6, 6) to the pose it
     finds, all axes together; nan if it finds none, for the reason in ``note``. on_the_way: (p,)
-    gain of the ``PARTS`` of the move. held_out: no run would choose its moments.
+    gain of the ``PARTS`` of the move. own: (6,) by which the metric is off on any drive. held_out: no run would
+    choose its moments.
     """
 
     metric: str
@@ -70,6 +71,7 @@ class Look:
     on_the_way: Array
     move: Array
     cov: Array
+    own: Array
     note: str = ""
 
     @property
@@ -91,7 +93,8 @@ class Look:
     def favours(self) -> Array:
         """(6,) standard errors by which a move along each axis is better, negative for one backwards; zero if no such
         move is clearly better."""
-        gain = np.where(TRUSTED & np.isfinite(self.gain), self.gain, 0.0)
+        trusted = np.abs(STEPS) >= BEYOND * self.own
+        gain = np.where(trusted & np.isfinite(self.gain), self.gain, 0.0)
         best = np.argmax(gain, axis=0), np.arange(6)
         by_step = np.where(gain[best] > CLEAR, np.sign(STEPS[best]) * gain[best], 0.0)
         times = np.nan_to_num(self.move / self.sigma)
@@ -210,7 +213,10 @@ def _look(comparison: Comparison, calibration: Calibration, config: Config) -> L
     pair, held_out = _held_out(comparison.pair, config)
     pair = replace(pair, prior=replace(pair.prior, cov=np.diag(AROUND**2)))
     steps, parts, one = (np.full(shape, np.nan) for shape in (STEPS.shape, PARTS.shape, (6, 6)))
-    look = Look(metric.id, pair.a.name, pair.b.name, len(pair), held_out, np.nan, steps, steps, parts, one[0], one)
+    own = np.array(metric.own) if isinstance(metric, CostMetric) else np.zeros(6)
+    look = Look(
+        metric.id, pair.a.name, pair.b.name, len(pair), held_out, np.nan, steps, steps, parts, one[0], one, own
+    )
     values = options(metric, config)
     try:
         moments = prepared(metric, pair, values) if isinstance(metric, CostMetric) else []

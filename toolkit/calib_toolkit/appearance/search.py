@@ -40,8 +40,6 @@ POPULATION = 12
 DRAWS = 24
 PARABOLA = np.array([0.02] * 3 + [np.radians(0.1)] * 3)
 """Metres, radians: how far around the best pose the cost is looked at, at least."""
-OWN = np.array([0.015] * 3 + [np.radians(0.03)] * 3)
-"""Metres, radians: by so much a metric is off on any drive (beams have a width, pictures an exposure)."""
 SHARPEST = (0.25, 0.5)
 """Sigma, in those of the motion, and blur with which the cost is looked at in the end."""
 LOOKS = 5
@@ -91,7 +89,7 @@ def estimate(
         return _refused(metric, pair, "in too few moments do both see the same")
     if np.linalg.norm(found.posterior) > FAR:
         return _refused(metric, pair, "the best pose lies further from the motion's than its sigma allows")
-    cov = frame.L @ found.cov @ frame.L.T + np.diag(OWN**2)
+    cov = frame.L @ found.cov @ frame.L.T + np.diag(np.square(metric.own))
     if _open(pair.prior, cov):
         return _refused(metric, pair, "the motion leaves the pose open, and what the two see does not tell it either")
     if found.apart > FAR / 2:
