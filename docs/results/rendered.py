@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 def main(out: Path, drives: Sequence[Path]) -> None:
     """A row for each sensor of each drive, and the means."""
     print("| drive | sensor | x, y, z mm | rx, ry, rz deg | NEES (6) | dt ms (sigma) |\n|---|---|---|---|---|---|")
-    found: list[float] = []
+    found, pulls = list[float](), list[Array]()
     for drive in drives:
         folder = out / "-".join(drive.parts[-2:])
         if not (folder / "calibration.json").is_file():
@@ -29,12 +29,18 @@ def main(out: Path, drives: Sequence[Path]) -> None:
         c, true = read_calibration(folder / "calibration.json"), read_calibration(drive / "truth.json")
         for name in c.names[1:]:
             e, nees, dt = compared(c, true, name)
-            found.append(nees)
+            if np.isfinite(nees):
+                found.append(nees)
+                pulls.append(np.abs(e) / c.sigma[c.index(name), :6])
             mm, deg = ", ".join(f"{v:.0f}" for v in 1e3 * e[:3]), ", ".join(f"{v:.3f}" for v in np.degrees(e[3:]))
             sigma = 1e3 * c.sigma[c.index(name), 6]
             print(f"| {drive.name} | {name} | {mm} | {deg} | {nees:.1f} | {1e3 * dt:.2f} ({sigma:.2f}) |", flush=True)
-    told = np.array(found)[np.isfinite(found)]
-    print(f"\n{len(told)} sensors: NEES {told.mean():.1f} on average, median {np.median(told):.1f} (5.3)")
+    print(f"\n{len(found)} sensors: NEES {np.mean(found):.1f} on average, median {np.median(found):.1f} (5.3)")
+    for k in (1, 2, 3):
+        within = 100 * (np.array(pulls) < k).mean(axis=0)
+        print(
+            f"within {k} sigma: {within.mean():.0f} %; {', '.join(f'{w:.0f}' for w in within)} by x, y, z, rx, ry, rz"
+        )
 
 
 def compared(c: Calibration, true: Calibration, name: str) -> tuple[Array, float, float]:
