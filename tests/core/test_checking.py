@@ -202,20 +202,17 @@ def look(metric, move, sigma=0.01):
     nothing = np.full(STEPS.shape, np.nan)
     cov = np.diag(np.broadcast_to(sigma, 6).astype(float) ** 2)
     way = np.full(checking.PARTS.shape, np.nan)
-    return Look(
-        metric,
-        "velo",
-        "cam0",
-        25,
-        True,
-        np.nan,
-        nothing,
-        nothing,
-        way,
-        np.asarray(move, dtype=float),
-        cov,
-        np.zeros(6),
-    )
+    move = np.asarray(move, dtype=float)
+    return Look(metric, "velo", "cam0", 25, True, np.nan, nothing, nothing, way, move, cov, np.zeros(6))
+
+
+def test_steps_no_longer_than_what_a_metric_is_off_by_do_not_count():
+    clear = np.where(STEPS > 0, 10.0, np.nan)
+    one = replace(look("a", np.zeros(6)), gain=clear)
+    assert (one.favours > 0).all()
+    leaning = replace(one, own=np.array([0, 0, 0.05, 0, 0, 0]))
+    assert leaning.favours[2] == 0
+    assert (np.delete(leaning.favours, 2) > 0).all()
 
 
 def test_a_way_along_a_valley_is_told_where_no_axis_alone_is():
